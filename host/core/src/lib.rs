@@ -1,0 +1,38 @@
+//! The nouns of Bumpless and its pure decisions.
+//!
+//! Owns: names, readings, descriptors, loop specifications, frames, effects, records, the messages of the control
+//! protocol, and every decision that is taken about them (schedule, guard, arbiter, takeover, selection, placement, swap).
+//! Never: reads a clock, draws a random number, waits, locks, or does I/O. Times and random numbers are arguments, so the
+//! same code runs in a host, in a test and under a model checker.
+//!
+//! Reading order: the nouns (`name` to `record`), the messages (`protocol`), then the decisions along one cycle
+//! (`tick`, `desk` with `arbiter`, `seat` with `select` and `swap`, `guard`), then `place` and `indices`.
+
+pub mod limits;
+
+pub mod name;
+pub mod digest;
+pub mod reading;
+pub mod descriptor;
+pub mod spec;
+pub mod frame;
+pub mod record;
+pub mod protocol;
+
+pub mod tick;
+pub mod arbiter;
+pub mod desk;
+pub mod select;
+pub mod swap;
+pub mod seat;
+pub mod guard;
+pub mod place;
+pub mod indices;
+
+pub use descriptor::{Descriptor, Direction, ParameterSpec, PortKind, PortSpec};
+pub use digest::Digest;
+pub use frame::{AlarmChange, Cycle, Effects, Fault, Frame, LogLevel, LogLine, Message, Priority};
+pub use name::{BusId, CellName, HostId, LoopId, NameError, PointId};
+pub use reading::{NoData, Quality, Reading};
+pub use record::{Applied, Command, CommandBody, CommandId, Event, Outcome, Record};
+pub use spec::{LoopSpec, Mode, OnFault, OutputLimit, Policy, SpecError, Strategy};

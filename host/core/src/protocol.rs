@@ -1,0 +1,144 @@
+//! The messages between a loop's home (the I/O host with its arbiter) and the hosts that hold the loop.
+//!
+//! ```text
+//! home ── Sample ──► owner ── StepRequest ──► replica
+//!                    owner ◄── StepAnswer ──── replica
+//! home ◄── Commit ── owner
+//! home ── Record ──► owner, standbys, history, live feed
+//! ```
+//!
+//! The home keeps the loop's time: it freezes the sample at the absolute deadline and names the owner in it. The record
+//! stream leaves the arbiter, so what a standby holds is what the actuator took.
+
+use std::sync::Arc;
+
+use serde::{Deserialize, Serialize};
+
+use crate::{
+    digest::Digest,
+    frame::{Effects, Fault, Frame, Message},
+    name::{HostId, LoopId},
+    reading::Reading,
+    record::{Command, Record},
+};
+
+/// One frozen cycle, from the home to the owner it names.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Sample {
+    /// The loop.
+    pub loop_id: LoopId,
+    /// Ownership under which the commit must come.
+    pub term: u64,
+    /// Number of the cycle.
+    pub seq: u64,
+    /// The host that shall run it.
+    pub owner: HostId,
+    /// The I/O host that sent it and takes the commit.
+    pub home: HostId,
+    /// When the readings were frozen.
+    pub at_ns: u64,
+    /// Time left until the commit counts as overdue, in ns, at the moment of sending.
+    pub left_ns: u64,
+    /// Revision in force, as the arbiter knows it.
+    pub revision: u64,
+    /// One reading per port of the component in force.
+    pub readings: Vec<Reading>,
+    /// Hosts that hold the loop and are believed alive, in rendezvous order.
+    pub members: Vec<HostId>,
+    /// Commands that no record holds yet, oldest first.
+    pub commands: Vec<Command>,
+    /// Messages for the loop that arrived since the last record.
+    pub messages: Vec<Message>,
+    /// Position of the last record, (term, seq); (0, 0) where there is none.
+    pub last: (u64, u64),
+    /// The last record itself, where the owner may not have it: at a takeover, or because it asked.
+    pub resume: Option<Arc<Record>>,
+}
+
+/// The owner's answer to a sample.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub enum Answer {
+    /// The cycle's record, to be taken with its outputs or not at all.
+    Commit(Box<Record>),
+    /// The owner does not hold the last record; the home sends the sample again with it.
+    NeedRecord {
+        /// The loop.
+        loop_id: LoopId,
+        /// The sample's term.
+        term: u64,
+        /// The sample's number.
+        seq: u64,
+        /// Who asks.
+        owner: HostId,
+    },
+    /// The owner cannot run the loop now; the home names another at once.
+    Decline {
+        /// The loop.
+        loop_id: LoopId,
+        /// The sample's term.
+        term: u64,
+        /// The sample's number.
+        seq: u64,
+        /// Who declines.
+        owner: HostId,
+        /// In words.
+        reason: String,
+    },
+}
+
+/// Why the arbiter did not take a commit.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, thiserror::Error)]
+pub enum Refusal {
+    /// Another host owns the loop.
+    #[error("the commit's term is old: another host owns the loop")]
+    OldTerm,
+    /// A record of this cycle, or a later one, was taken before.
+    #[error("the commit's cycle was taken before")]
+    OldSeq,
+    /// A term or cycle that the arbiter never gave out.
+    #[error("the commit names a term or cycle that was never given out")]
+    NeverGiven,
+    /// The committing host is not the owner.
+    #[error("the committing host does not own the loop")]
+    NotOwner,
+    /// An output is not finite, out of range, or there are too few or too many.
+    #[error("an output is not finite, outside its point's range, or missing")]
+    BadOutput,
+    /// No such loop here.
+    #[error("the loop has no home here")]
+    NoSuchLoop,
+}
+
+/// A step for a replica.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct StepRequest {
+    /// Where the answer goes.
+    pub from: HostId,
+    /// Matches the answer to the request.
+    pub correlation: u64,
+    /// The loop, so that the replica keeps one instance for it.
+    pub loop_id: LoopId,
+    /// The component.
+    pub digest: Digest,
+    /// Longest time of the step, in ns.
+    pub limit_ns: u64,
+    /// What the step sees.
+    pub frame: Frame,
+    /// The state before.
+    pub state: Arc<[u8]>,
+}
+
+/// A replica's answer.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct StepAnswer {
+    /// Who answers.
+    pub from: HostId,
+    /// The request's correlation.
+    pub correlation: u64,
+    /// The loop.
+    pub loop_id: LoopId,
+    /// What came of it.
+    pub result: Result<Effects, Fault>,
+    /// Time inside the component, in ns.
+    pub step_ns: u64,
+}

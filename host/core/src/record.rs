@@ -1,0 +1,169 @@
+//! What one cycle leaves behind: enough for anyone to go on from here, and for history to say what happened.
+//! PID 4.0's shift register, generalised.
+
+use std::sync::Arc;
+
+use serde::{Deserialize, Serialize};
+
+use crate::{
+    digest::Digest,
+    frame::{AlarmChange, LogLine, Message},
+    name::{HostId, LoopId},
+    reading::Reading,
+    spec::Mode,
+};
+
+/// Names a command, so that asking twice does it once.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
+pub struct CommandId(pub u128);
+
+/// What an operator or engineer wants of a running loop.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub enum CommandBody {
+    /// A new setpoint.
+    Setpoint(f64),
+    /// Manual or automatic.
+    Mode(Mode),
+    /// The outputs in manual, one per connected output port in order.
+    Output(Vec<f64>),
+    /// Go on with this revision of the specification: other parameters, strategy, limits or component.
+    Revise(u64),
+}
+
+/// A command on its way. It waits at the arbiter, rides in every sample until a record holds its outcome.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Command {
+    /// Names it.
+    pub id: CommandId,
+    /// What is wanted.
+    pub body: CommandBody,
+}
+
+/// How a command ended.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub enum Outcome {
+    /// It is part of this record.
+    Done,
+    /// It is not, and why.
+    Refused(String),
+}
+
+/// A command and how it ended.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Applied {
+    /// The command.
+    pub id: CommandId,
+    /// Its end.
+    pub outcome: Outcome,
+}
+
+/// Something that a cycle met and that people should hear of.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub enum Event {
+    /// The first step of this ownership.
+    TookOver {
+        /// The owner before, if there was one.
+        from: Option<HostId>,
+    },
+    /// A replica did not answer in time, and the next was asked.
+    Hedged {
+        /// The silent replica.
+        replica: HostId,
+    },
+    /// A step ended with a fault.
+    Faulted {
+        /// Where.
+        replica: HostId,
+        /// In words.
+        fault: String,
+    },
+    /// The policy decided the output because no step was good.
+    PolicyHeld,
+    /// The loop went on with another revision.
+    Revised {
+        /// The revision before.
+        from: u64,
+        /// The digest before.
+        from_digest: Digest,
+        /// How the state came over: "migrate", "start" or "same".
+        by: String,
+        /// Output step beyond what the old controller would have done, in % of span.
+        bump_percent: f64,
+    },
+    /// A fault in probation sent the loop back to the revision before.
+    RolledBack {
+        /// The revision left.
+        from: u64,
+        /// In words.
+        reason: String,
+    },
+    /// An output met a limit: port number.
+    Limited(u8),
+    /// A required input was bad.
+    BadInput(u8),
+}
+
+/// What one cycle leaves. Written once by the owner, completed and ordered by the arbiter.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Record {
+    /// The loop.
+    pub loop_id: LoopId,
+    /// Number of the ownership.
+    pub term: u64,
+    /// Number of the cycle.
+    pub seq: u64,
+    /// Revision of the specification that was in force.
+    pub revision: u64,
+    /// The component that stepped.
+    pub digest: Digest,
+    /// The host that ran the cycle.
+    pub owner: HostId,
+    /// The host whose replica gave the effects.
+    pub stepped_by: HostId,
+    /// When the sample was frozen, in ns of the I/O server's clock.
+    pub at_ns: u64,
+    /// Time since the record before, in ns.
+    pub dt_ns: u64,
+    /// Who decided the output.
+    pub mode: Mode,
+    /// Wanted value.
+    pub setpoint: f64,
+    /// What the operator set for manual, one per output port; follows the outputs in automatic.
+    pub manual: Vec<f64>,
+    /// What the step saw, one reading per port.
+    pub readings: Vec<Reading>,
+    /// What the controller wanted, one per output port; NaN never.
+    pub wanted: Vec<f64>,
+    /// What the arbiter let through, one per output port.
+    pub outputs: Vec<f64>,
+    /// The controller's state after the step.
+    pub state: Arc<[u8]>,
+    /// Faulty cycles in a row, up to and with this one.
+    pub faults_in_row: u32,
+    /// While a swap is on probation: the revision to fall back to and the cycles left.
+    pub probation: Option<(u64, u32)>,
+    /// Outcomes of the latest commands, oldest first.
+    pub applied: Vec<Applied>,
+    /// What the cycle met.
+    pub events: Vec<Event>,
+    /// What the controller raised and cleared.
+    pub alarms: Vec<AlarmChange>,
+    /// What it published.
+    pub messages: Vec<Message>,
+    /// What it logged.
+    pub log: Vec<LogLine>,
+    /// Time of the step as the owner saw it, in ns: network included.
+    pub step_ns: u64,
+    /// Time from the sample's arrival at the owner to its commit, in ns.
+    pub cycle_ns: u64,
+    /// Time from the deadline to the actuator's write, in ns of the I/O server's clock; set by the arbiter.
+    pub committed_after_ns: u64,
+}
+
+impl Record {
+    /// Where the record stands in the order that the arbiter keeps.
+    #[must_use]
+    pub const fn position(&self) -> (u64, u64) {
+        (self.term, self.seq)
+    }
+}

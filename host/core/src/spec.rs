@@ -1,0 +1,300 @@
+//! A loop's specification: what the engineer decides. One revision of it is current at a time.
+//!
+//! Owns the checks that need nothing but the text itself; what needs a component or the points is checked at deployment.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+use crate::{
+    digest::Digest,
+    limits::{PERIOD_NS_MAX, PERIOD_NS_MIN, REPLICAS_MAX},
+    name::{LoopId, PointId},
+};
+
+/// Who decides the output.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Mode {
+    /// The operator.
+    Manual,
+    /// The controller.
+    Automatic,
+}
+
+/// How the owner chooses the replica that steps.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Strategy {
+    /// Each in turn, by cycle number.
+    RoundRobin,
+    /// Any, evenly.
+    Random,
+    /// The least loaded processor.
+    Cpu,
+    /// The shortest smoothed latency.
+    Latency,
+    /// Two at random, the better by latency times load.
+    P2c,
+    /// The owner itself.
+    Local,
+    /// The same one for a loop, by rendezvous hash.
+    Shard,
+}
+
+impl Strategy {
+    /// All of them, in the order in which they are documented.
+    pub const ALL: [Self; 7] =
+        [Self::RoundRobin, Self::Random, Self::Cpu, Self::Latency, Self::P2c, Self::Local, Self::Shard];
+
+    /// The name used in configuration, API and command line.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::RoundRobin => "round-robin",
+            Self::Random => "random",
+            Self::Cpu => "cpu",
+            Self::Latency => "latency",
+            Self::P2c => "p2c",
+            Self::Local => "local",
+            Self::Shard => "shard",
+        }
+    }
+}
+
+impl std::str::FromStr for Strategy {
+    type Err = SpecError;
+    fn from_str(text: &str) -> Result<Self, SpecError> {
+        Self::ALL.into_iter().find(|s| s.name() == text).ok_or_else(|| SpecError::Strategy(text.chars().take(64).collect()))
+    }
+}
+
+impl Mode {
+    /// The name used in configuration, API and command line.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Manual => "manual",
+            Self::Automatic => "automatic",
+        }
+    }
+}
+
+impl std::str::FromStr for Mode {
+    type Err = SpecError;
+    fn from_str(text: &str) -> Result<Self, SpecError> {
+        [Self::Manual, Self::Automatic]
+            .into_iter()
+            .find(|m| m.name() == text)
+            .ok_or_else(|| SpecError::Mode(text.chars().take(64).collect()))
+    }
+}
+
+/// What an output may do, outside the sandbox, whatever the controller says.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct OutputLimit {
+    /// Least value, in the point's unit.
+    pub low: f64,
+    /// Greatest value.
+    pub high: f64,
+    /// Greatest change per second; none for no limit.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub rate_per_s: Option<f64>,
+    /// Where the output goes when the policy says "safe value".
+    pub safe: f64,
+}
+
+/// What a loop does when it has no good step.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum OnFault {
+    /// Keep the output.
+    Hold,
+    /// Move the output to its safe value, at its rate limit.
+    SafeValue,
+    /// Keep the output and put the loop in manual.
+    Manual,
+}
+
+/// The bounds within which the host runs the loop.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Policy {
+    /// What happens after `faults_tolerated` faulty cycles in a row; until then the output holds.
+    pub on_fault: OnFault,
+    /// Faulty cycles in a row that only hold.
+    pub faults_tolerated: u32,
+    /// What happens when a required input is bad; same scale as `on_fault`.
+    pub on_bad_input: OnFault,
+    /// Longest time of one step, in µs; 0 for a quarter of the period, at most 10 ms.
+    pub step_limit_us: u64,
+    /// Part of the period after which a silent replica is given up and the next one asked as well.
+    pub hedge_part: f64,
+    /// Part of the period after which a missing commit moves the ownership.
+    pub takeover_part: f64,
+    /// Greatest step of an output at a swap beyond what the old controller would have done, in % of the output's span.
+    pub bump_limit_percent: f64,
+    /// Cycles after a swap during which a fault rolls back to the old component.
+    pub probation_cycles: u32,
+}
+
+impl Default for Policy {
+    fn default() -> Self {
+        Self {
+            on_fault: OnFault::Hold,
+            faults_tolerated: 3,
+            on_bad_input: OnFault::Hold,
+            step_limit_us: 0,
+            // The owner must have tried a replica and itself before the arbiter looks elsewhere, so hedge < takeover.
+            hedge_part: 0.2,
+            takeover_part: 0.5,
+            bump_limit_percent: 5.0,
+            probation_cycles: 20,
+        }
+    }
+}
+
+/// One revision of a loop.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct LoopSpec {
+    /// The loop.
+    pub id: LoopId,
+    /// Grows by one with each change; given by the loop's I/O host, 0 before that.
+    pub revision: u64,
+    /// The component.
+    pub digest: Digest,
+    /// Time between cycles, in ns.
+    pub period_ns: u64,
+    /// Which point each port is connected to, by port name.
+    pub ports: BTreeMap<String, PointId>,
+    /// Parameters that differ from their defaults, by name.
+    pub parameters: BTreeMap<String, f64>,
+    /// Setpoint of the first start; later ones are commands.
+    pub setpoint: f64,
+    /// Least and greatest setpoint accepted.
+    pub setpoint_range: (f64, f64),
+    /// Mode of the first start; later ones are commands.
+    pub mode: Mode,
+    /// How the replica that steps is chosen.
+    pub strategy: Strategy,
+    /// Hosts that hold the loop: the owner and its standbys, all of them replicas.
+    pub replicas: u8,
+    /// Bounds of each connected output, by port name. A port without one is bound by its point's range.
+    pub limits: BTreeMap<String, OutputLimit>,
+    /// The bounds within which the host runs the loop.
+    pub policy: Policy,
+}
+
+/// What is wrong with a specification.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum SpecError {
+    /// Out of range.
+    #[error("period {0} ns: a loop's period is 1 ms to 1 h")]
+    Period(u64),
+    /// Out of range.
+    #[error("replicas = {0}: 1 to {REPLICAS_MAX} are possible")]
+    Replicas(u8),
+    /// Not a strategy.
+    #[error("strategy {0:?} is unknown: use round-robin, random, cpu, latency, p2c, local or shard")]
+    Strategy(String),
+    /// Not a mode.
+    #[error("mode {0:?} is unknown: use manual or automatic")]
+    Mode(String),
+    /// No order, or not finite.
+    #[error("setpoint {setpoint} with range {low} to {high}: the range must hold it and be finite")]
+    Setpoint {
+        /// The setpoint.
+        setpoint: f64,
+        /// Least.
+        low: f64,
+        /// Greatest.
+        high: f64,
+    },
+    /// No order, or not finite.
+    #[error("limits of {port:?}: low <= safe <= high must hold, rate_per_s must be greater than 0, all finite")]
+    Limit {
+        /// The port.
+        port: String,
+    },
+    /// Out of range.
+    #[error("policy: {0}")]
+    Policy(&'static str),
+    /// The component needs it.
+    #[error("port {0:?} of the component must be connected to a point")]
+    PortMissing(String),
+    /// The component has no such port.
+    #[error("the component has no port {name:?}; it has {known}")]
+    PortUnknown {
+        /// The name given.
+        name: String,
+        /// The names that exist.
+        known: String,
+    },
+    /// The component refuses a parameter.
+    #[error(transparent)]
+    Parameter(#[from] crate::descriptor::DescriptorError),
+}
+
+impl LoopSpec {
+    /// Checks everything that needs nothing but the specification itself.
+    pub fn check(&self) -> Result<(), SpecError> {
+        if !(PERIOD_NS_MIN..=PERIOD_NS_MAX).contains(&self.period_ns) {
+            return Err(SpecError::Period(self.period_ns));
+        }
+        if self.replicas == 0 || usize::from(self.replicas) > REPLICAS_MAX {
+            return Err(SpecError::Replicas(self.replicas));
+        }
+        let (low, high) = self.setpoint_range;
+        let ordered = low.is_finite() && high.is_finite() && (low..=high).contains(&self.setpoint);
+        if !ordered {
+            return Err(SpecError::Setpoint { setpoint: self.setpoint, low, high });
+        }
+        for (port, l) in &self.limits {
+            let rate_ok = l.rate_per_s.is_none_or(|r| r.is_finite() && r > 0.0);
+            let range_ok = l.low.is_finite() && l.high.is_finite() && (l.low..=l.high).contains(&l.safe);
+            if !(rate_ok && range_ok) {
+                return Err(SpecError::Limit { port: port.clone() });
+            }
+        }
+        let p = &self.policy;
+        if !(0.01..=0.9).contains(&p.hedge_part) {
+            return Err(SpecError::Policy("hedge_part must be 0.01 to 0.9 of the period"));
+        }
+        if !(p.takeover_part > p.hedge_part && p.takeover_part <= 0.95) {
+            return Err(SpecError::Policy("takeover_part must be greater than hedge_part and at most 0.95 of the period"));
+        }
+        if !(p.bump_limit_percent >= 0.0 && p.bump_limit_percent.is_finite()) {
+            return Err(SpecError::Policy("bump_limit_percent must be 0 or more"));
+        }
+        if p.step_limit_us.saturating_mul(1000) > self.period_ns {
+            return Err(SpecError::Policy("step_limit_us must not be longer than the period"));
+        }
+        Ok(())
+    }
+
+    /// Checks what the component says against what the loop connects and sets.
+    pub fn check_against(&self, descriptor: &crate::Descriptor) -> Result<(), SpecError> {
+        let known = || descriptor.ports.iter().map(|p| p.name.as_str()).collect::<Vec<_>>().join(", ");
+        for name in self.ports.keys().chain(self.limits.keys()) {
+            if descriptor.port(name).is_none() {
+                return Err(SpecError::PortUnknown { name: name.clone(), known: known() });
+            }
+        }
+        if let Some(p) = descriptor.ports.iter().find(|p| p.required && !self.ports.contains_key(&p.name)) {
+            return Err(SpecError::PortMissing(p.name.clone()));
+        }
+        descriptor.parameter_values(self.parameters.iter().map(|(n, v)| (n.as_str(), *v)))?;
+        Ok(())
+    }
+
+    /// Longest time of one step, in ns: what the policy says, or a quarter of the period but at most 10 ms, so that a
+    /// spinning guest is stopped early enough for the fallback to act within the same period.
+    #[must_use]
+    pub fn step_limit_ns(&self) -> u64 {
+        match self.policy.step_limit_us {
+            0 => (self.period_ns / 4).min(10_000_000),
+            us => us * 1000,
+        }
+    }
+}
