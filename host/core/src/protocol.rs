@@ -43,6 +43,8 @@ pub struct Sample {
     pub revision: u64,
     /// One reading per port of the component in force.
     pub readings: Vec<Reading>,
+    /// While a change of revision waits: its number, and one reading per port of its component.
+    pub next_readings: Option<(u64, Vec<Reading>)>,
     /// Hosts that hold the loop and are believed alive, in rendezvous order.
     pub members: Vec<HostId>,
     /// Commands that no record holds yet, oldest first.
@@ -92,9 +94,12 @@ pub enum Refusal {
     /// Another host owns the loop.
     #[error("the commit's term is old: another host owns the loop")]
     OldTerm,
-    /// A record of this cycle, or a later one, was taken before.
-    #[error("the commit's cycle was taken before")]
+    /// The cycle was taken before, or the next one has begun.
+    #[error("the commit's cycle was taken before, or the next one has begun")]
     OldSeq,
+    /// The record does not go on from the last one taken.
+    #[error("the commit does not go on from the last record")]
+    WrongBase,
     /// A term or cycle that the arbiter never gave out.
     #[error("the commit names a term or cycle that was never given out")]
     NeverGiven,

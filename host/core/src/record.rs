@@ -112,6 +112,8 @@ pub struct Record {
     pub term: u64,
     /// Number of the cycle.
     pub seq: u64,
+    /// Position of the record that this one goes on from; (0, 0) for a first start.
+    pub after: (u64, u64),
     /// Revision of the specification that was in force.
     pub revision: u64,
     /// The component that stepped.
@@ -165,5 +167,39 @@ impl Record {
     #[must_use]
     pub const fn position(&self) -> (u64, u64) {
         (self.term, self.seq)
+    }
+}
+
+/// A plain record for tests of this crate.
+#[cfg(test)]
+pub(crate) fn test_record() -> Record {
+    Record {
+        loop_id: LoopId::new("l").expect("valid"),
+        term: 1,
+        seq: 1,
+        after: (0, 0),
+        revision: 1,
+        digest: Digest::of(b"a"),
+        owner: HostId::new("h1").expect("valid"),
+        stepped_by: HostId::new("h1").expect("valid"),
+        at_ns: 1_000,
+        dt_ns: 1_000,
+        mode: Mode::Automatic,
+        setpoint: 1.0,
+        manual: vec![0.0],
+        readings: vec![],
+        wanted: vec![0.0],
+        outputs: vec![0.0],
+        state: Arc::from([]),
+        faults_in_row: 0,
+        probation: None,
+        applied: vec![],
+        events: vec![],
+        alarms: vec![],
+        messages: vec![],
+        log: vec![],
+        step_ns: 0,
+        cycle_ns: 0,
+        committed_after_ns: 0,
     }
 }

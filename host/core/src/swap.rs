@@ -1,1 +1,80 @@
-//! Soon.
+//! Going on with another revision while the loop runs: what is kept, how large the bump is, and when to go back.
+//!
+//! ```text
+//! in force ── Revise(r) rides in a sample ──► hand over: same state | migrate | start(track)
+//!     ▲                                          │ bump within the loop's limit?
+//!     │ no: refused, the old one keeps the cycle │ yes
+//!     │                                          ▼
+//!     └──── a fault within n cycles ───────── probation(n) ──► done
+//!           (same cycle, old component, start from what the actuators hold)
+//! ```
+
+use crate::{
+    record::Record,
+    spec::LoopSpec,
+};
+
+/// How the controller's state comes over.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum HandOver {
+    /// Component and parameters stay; so do the bytes.
+    Same,
+    /// `migrate`, and `start` with what the actuators hold where it declines.
+    Migrate,
+}
+
+/// What a change from `old` to `new` asks of the state.
+#[must_use]
+pub fn hand_over(old: &LoopSpec, new: &LoopSpec) -> HandOver {
+    if old.digest == new.digest && old.parameters == new.parameters && old.ports == new.ports {
+        HandOver::Same
+    } else {
+        HandOver::Migrate
+    }
+}
+
+/// The bump of a switch, in % of span: how far the new outputs are from what the old controller would have sent in the
+/// same cycle, for the worst output. `spans` has the span of each output. Infinite where the outputs cannot be compared.
+#[must_use]
+pub fn bump_percent(old_outputs: &[f64], new_outputs: &[f64], spans: &[f64]) -> f64 {
+    if old_outputs.len() != new_outputs.len() || spans.len() != new_outputs.len() {
+        return f64::INFINITY;
+    }
+    old_outputs
+        .iter()
+        .zip(new_outputs)
+        .zip(spans)
+        .map(|((old, new), span)| 100.0 * (new - old).abs() / span)
+        // `max` would drop a NaN; a bump that cannot be told is not a small one.
+        .fold(0.0, |worst: f64, b| if b.is_nan() { f64::INFINITY } else { worst.max(b) })
+}
+
+/// The probation that the next record carries: it counts down and ends by itself.
+#[must_use]
+pub fn probation_after(before: Option<&Record>) -> Option<(u64, u32)> {
+    before.and_then(|r| r.probation).and_then(|(revision, left)| (left > 1).then(|| (revision, left - 1)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::record::test_record;
+
+    #[test]
+    fn bump_is_the_worst_output_in_percent_of_its_span() {
+        assert_eq!(bump_percent(&[50.0, 5.0], &[50.5, 5.0], &[100.0, 10.0]), 0.5);
+        assert_eq!(bump_percent(&[50.0, 5.0], &[50.5, 6.0], &[100.0, 10.0]), 10.0);
+        assert_eq!(bump_percent(&[50.0], &[f64::NAN], &[100.0]), f64::INFINITY);
+        assert_eq!(bump_percent(&[50.0], &[50.0, 1.0], &[100.0, 1.0]), f64::INFINITY);
+    }
+
+    #[test]
+    fn probation_ends() {
+        let mut record = test_record();
+        record.probation = Some((3, 2));
+        assert_eq!(probation_after(Some(&record)), Some((3, 1)));
+        record.probation = Some((3, 1));
+        assert_eq!(probation_after(Some(&record)), None);
+        assert_eq!(probation_after(None), None);
+    }
+}
