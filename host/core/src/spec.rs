@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     digest::Digest,
-    limits::{PERIOD_NS_MAX, PERIOD_NS_MIN, REPLICAS_MAX},
+    limits::{MESSAGES_PER_STEP_MAX, PERIOD_NS_MAX, PERIOD_NS_MIN, REPLICAS_MAX},
     name::{LoopId, PointId},
 };
 
@@ -182,6 +182,8 @@ pub struct LoopSpec {
     pub replicas: u8,
     /// Bounds of each connected output, by port name. A port without one is bound by its point's range.
     pub limits: BTreeMap<String, OutputLimit>,
+    /// Topics whose messages the controller receives; at most 16.
+    pub listens: Vec<String>,
     /// The bounds within which the host runs the loop.
     pub policy: Policy,
 }
@@ -217,6 +219,9 @@ pub enum SpecError {
         /// The port.
         port: String,
     },
+    /// Too many topics, or one that is empty or too long.
+    #[error("listens: at most {MESSAGES_PER_STEP_MAX} topics of 1 to 64 characters")]
+    Listens,
     /// Out of range.
     #[error("policy: {0}")]
     Policy(&'static str),
@@ -256,6 +261,9 @@ impl LoopSpec {
             if !(rate_ok && range_ok) {
                 return Err(SpecError::Limit { port: port.clone() });
             }
+        }
+        if self.listens.len() > MESSAGES_PER_STEP_MAX || self.listens.iter().any(|t| t.is_empty() || t.len() > 64) {
+            return Err(SpecError::Listens);
         }
         let p = &self.policy;
         if !(0.01..=0.9).contains(&p.hedge_part) {

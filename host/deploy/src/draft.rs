@@ -1,0 +1,60 @@
+//! A loop as people write it: TOML in a file, JSON over the API. Unknown keys are refused.
+//!
+//! Never: reaches for a component or a point; [`crate::Deploy::apply`] turns a draft into a checked specification.
+
+use std::collections::BTreeMap;
+
+use bumpless_core::{Mode, OutputLimit, Policy, Strategy};
+use serde::{Deserialize, Serialize};
+
+const fn three() -> u8 {
+    3
+}
+
+const fn automatic() -> Mode {
+    Mode::Automatic
+}
+
+const fn round_robin() -> Strategy {
+    Strategy::RoundRobin
+}
+
+/// A loop file.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LoopDraft {
+    /// Name of the loop.
+    pub name: String,
+    /// The component: `name`, `name@version`, or a digest (64 digits, or at least the first 8).
+    pub component: String,
+    /// Time between cycles, in ms; 1 to 3,600,000. Fractions are allowed.
+    pub period_ms: f64,
+    /// Which point each port is connected to: port name → point name.
+    pub ports: BTreeMap<String, String>,
+    /// Parameters that differ from their defaults.
+    #[serde(default)]
+    pub parameters: BTreeMap<String, f64>,
+    /// Setpoint of the first start.
+    pub setpoint: f64,
+    /// Least and greatest setpoint; the measured point's range where not given.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub setpoint_range: Option<(f64, f64)>,
+    /// Mode of the first start.
+    #[serde(default = "automatic")]
+    pub mode: Mode,
+    /// How the replica that steps is chosen.
+    #[serde(default = "round_robin")]
+    pub strategy: Strategy,
+    /// Hosts that hold the loop.
+    #[serde(default = "three")]
+    pub replicas: u8,
+    /// Bounds of outputs by port name; the point's range where not given.
+    #[serde(default)]
+    pub limits: BTreeMap<String, OutputLimit>,
+    /// Topics whose messages the controller receives.
+    #[serde(default)]
+    pub listens: Vec<String>,
+    /// Fault, hedge, takeover and swap policy.
+    #[serde(default)]
+    pub policy: Policy,
+}

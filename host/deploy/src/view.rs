@@ -1,0 +1,184 @@
+//! What the outside sees of a cell: plain data, copied out, never read back as intent.
+
+use std::sync::Arc;
+
+use bumpless_core::{
+    Applied, ComponentInfo, Digest, HostId, LoopId, LoopSpec, Mode, PointId, Quality, Record, desk::Tally,
+};
+
+/// A component and where it stands.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ComponentView {
+    /// What it is.
+    pub info: ComponentInfo,
+    /// Loops that run it, or keep it to go back to.
+    pub used_by: Vec<LoopId>,
+    /// Hosts that hold it compiled.
+    pub ready_on: Vec<HostId>,
+}
+
+/// A loop as a host sees it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LoopView {
+    /// The loop.
+    pub id: LoopId,
+    /// Its I/O host.
+    pub home: HostId,
+    /// The revision in force.
+    pub spec: LoopSpec,
+    /// A revision on its way.
+    pub pending: Option<u64>,
+    /// Revisions that can be gone back to, newest first.
+    pub past: Vec<u64>,
+    /// `name@version` of the component in force, or its short digest where the library does not know it.
+    pub component: String,
+    /// The last record that this host saw.
+    pub last: Option<Arc<Record>>,
+    /// Age of that record, in ms by this host's clock since it arrived.
+    pub last_age_ms: Option<u64>,
+    /// Live members in rank order, as far as this host knows.
+    pub members: Vec<HostId>,
+    /// Counts; only the home has them.
+    pub tally: Option<Tally>,
+}
+
+/// A host as another sees it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct HostView {
+    /// The host.
+    pub id: HostId,
+    /// Is it this one?
+    pub here: bool,
+    /// Is it alive by liveliness and fresh vitals?
+    pub alive: bool,
+    /// Serves I/O.
+    pub io: bool,
+    /// Runs controllers.
+    pub control: bool,
+    /// Is it being emptied?
+    pub draining: bool,
+    /// Address of its API.
+    pub api: Option<String>,
+    /// Load of the cores that it may use, 0 to 1.
+    pub cpu: f32,
+    /// Its own use, in cores.
+    pub cpu_process: f32,
+    /// Resident bytes.
+    pub memory_bytes: u64,
+    /// Smoothed latency of a step there, as this host measures it, in ns.
+    pub latency_ns: Option<u64>,
+    /// Loops it owns now.
+    pub loops_owned: u32,
+    /// Loops it holds.
+    pub loops_held: u32,
+    /// Program version.
+    pub version: String,
+}
+
+/// A point as its I/O host sees it.
+#[derive(Debug, Clone, PartialEq, serde::Serialize, serde::Deserialize)]
+pub struct PointView {
+    /// The point.
+    pub id: PointId,
+    /// Its I/O host.
+    pub host: HostId,
+    /// Its bus.
+    pub bus: String,
+    /// Unit.
+    pub unit: String,
+    /// Least and greatest value.
+    pub range: (f64, f64),
+    /// May it be written?
+    pub writable: bool,
+    /// Value now, or the last good one.
+    pub value: Option<f64>,
+    /// How far it may be trusted.
+    pub quality: Quality,
+    /// Why there is no value, in words; empty where there is one.
+    pub reason: String,
+    /// Age of the value, in ms.
+    pub age_ms: u64,
+    /// The loop that writes it, if any.
+    pub written_by: Option<LoopId>,
+    /// One line for people.
+    pub text: String,
+}
+
+/// How an `apply` ended.
+#[derive(Debug, Clone, PartialEq, serde::Serialize, serde::Deserialize)]
+pub struct ApplyEnd {
+    /// The loop.
+    pub id: LoopId,
+    /// The revision in force now.
+    pub revision: u64,
+    /// Was the loop new?
+    pub created: bool,
+    /// Nothing differed, so nothing was done.
+    pub unchanged: bool,
+    /// How a change of a running loop went: hand-over and bump.
+    pub hand_over: Option<HandOverView>,
+}
+
+/// How a state came over, as the committed record says.
+#[derive(Debug, Clone, PartialEq, serde::Serialize, serde::Deserialize)]
+pub struct HandOverView {
+    /// "same", "migrate" or "start".
+    pub by: String,
+    /// Output step beyond what the old controller would have done, in % of span.
+    pub bump_percent: f64,
+    /// Digest before.
+    pub from_digest: Digest,
+}
+
+/// How a command ended: it is part of a committed record.
+#[derive(Debug, Clone, PartialEq, serde::Serialize, serde::Deserialize)]
+pub struct CommandEnd {
+    /// Its id and outcome.
+    pub applied: Applied,
+    /// Position of the record that holds it.
+    pub position: (u64, u64),
+    /// Mode in force with that record.
+    pub mode: Mode,
+    /// Setpoint in force with that record.
+    pub setpoint: f64,
+}
+
+/// A step asked for from outside: the cell as a control service.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Call {
+    /// Component reference, as in a loop file.
+    pub component: String,
+    /// How the replica is chosen.
+    pub strategy: bumpless_core::Strategy,
+    /// Parameters by name; defaults for the rest. Used where `state` is none.
+    pub parameters: std::collections::BTreeMap<String, f64>,
+    /// State from the call before; none for a first step.
+    pub state: Option<Vec<u8>>,
+    /// What the outputs hold, by output port name.
+    pub track: std::collections::BTreeMap<String, f64>,
+    /// Input values by port name.
+    pub inputs: std::collections::BTreeMap<String, f64>,
+    /// Wanted value.
+    pub setpoint: f64,
+    /// Who decides the output.
+    pub mode: Mode,
+    /// Time since the call before, in ns; at least 1.
+    pub dt_ns: u64,
+    /// Number of the call; chooses the turn in round-robin.
+    pub seq: u64,
+}
+
+/// What a call gave.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CallEnd {
+    /// The host that stepped.
+    pub host: HostId,
+    /// State for the next call.
+    pub state: Vec<u8>,
+    /// Outputs by port name.
+    pub outputs: std::collections::BTreeMap<String, f64>,
+    /// Time inside the component, in ns.
+    pub step_ns: u64,
+    /// Time until the answer, network included, in ns.
+    pub total_ns: u64,
+}
