@@ -70,12 +70,7 @@ impl ComponentInfo {
     pub fn check(&self) -> Result<(), ComponentInfoError> {
         self.descriptor.check()?;
         if self.name != self.descriptor.name || self.version != self.descriptor.version {
-            let cut = |name: &str, version: &str| {
-                format!("{name} {version}")
-                    .chars()
-                    .take(TEXT_CHARS_MAX)
-                    .collect()
-            };
+            let cut = |name: &str, version: &str| format!("{name} {version}").chars().take(TEXT_CHARS_MAX).collect();
             return Err(ComponentInfoError::Differs {
                 said: cut(&self.name, &self.version),
                 described: cut(&self.descriptor.name, &self.descriptor.version),
@@ -146,18 +141,9 @@ mod tests {
             (|i| i.name = "other".into(), "\"other 1.0.0\""),
             (|i| i.version = "2.0.0".into(), "\"pid 2.0.0\""),
             (|i| i.bytes = 0, "0 bytes"),
-            (
-                |i| i.bytes = COMPONENT_BYTES_MAX as u64 + 1,
-                "33554433 bytes",
-            ),
-            (
-                |i| i.imports = vec![String::new(); IMPORTS_MAX + 1],
-                "65 imports",
-            ),
-            (
-                |i| i.uploaded_by = "x".repeat(TEXT_CHARS_MAX + 1),
-                "uploaded_by",
-            ),
+            (|i| i.bytes = COMPONENT_BYTES_MAX as u64 + 1, "33554433 bytes"),
+            (|i| i.imports = vec![String::new(); IMPORTS_MAX + 1], "65 imports"),
+            (|i| i.uploaded_by = "x".repeat(TEXT_CHARS_MAX + 1), "uploaded_by"),
             (|i| i.note = "x".repeat(TEXT_CHARS_MAX + 1), "the note"),
         ];
         for (spoil, part) in table {

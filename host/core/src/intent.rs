@@ -64,9 +64,7 @@ pub enum IntentError {
         known: String,
     },
     /// Only what is on its way can be withdrawn.
-    #[error(
-        "revision {0} is not on its way, so it cannot be withdrawn: roll back to an earlier one instead"
-    )]
+    #[error("revision {0} is not on its way, so it cannot be withdrawn: roll back to an earlier one instead")]
     NotPending(u64),
     /// The revision numbers are used up.
     #[error("loop {0:?} has used all revision numbers: create it under another name")]
@@ -130,11 +128,7 @@ impl Intent {
         if self.current.revision == revision {
             return Ok(false);
         }
-        let next = if self
-            .pending
-            .as_ref()
-            .is_some_and(|p| p.revision == revision)
-        {
+        let next = if self.pending.as_ref().is_some_and(|p| p.revision == revision) {
             self.pending.take()
         } else {
             let place = self.past.iter().position(|p| p.revision == revision);
@@ -182,16 +176,12 @@ impl Intent {
     /// left is newer, so going back twice never leads forth again.
     #[must_use]
     pub fn previous(&self) -> Option<&LoopSpec> {
-        self.past
-            .iter()
-            .find(|spec| spec.revision < self.current.revision)
+        self.past.iter().find(|spec| spec.revision < self.current.revision)
     }
 
     /// All revisions there are: in force, on its way, then the past ones.
     pub fn revisions(&self) -> impl Iterator<Item = &LoopSpec> {
-        std::iter::once(&self.current)
-            .chain(&self.pending)
-            .chain(&self.past)
+        std::iter::once(&self.current).chain(&self.pending).chain(&self.past)
     }
 
     /// Where this copy stands among the copies of the loop's intent: the greater one is newer. It holds across the removal
@@ -337,15 +327,9 @@ mod tests {
                 intent.propose(other).unwrap_err(),
                 "loop \"flow-1\", the intent of loop \"level-1\"",
             ),
-            (
-                intent.propose(spec(3.0)).unwrap_err(),
-                "revision 2 is still on its way",
-            ),
+            (intent.propose(spec(3.0)).unwrap_err(), "revision 2 is still on its way"),
             (intent.commit(7).unwrap_err(), "no revision 7; it has 1, 2"),
-            (
-                intent.withdraw(1).unwrap_err(),
-                "revision 1 is not on its way",
-            ),
+            (intent.withdraw(1).unwrap_err(), "revision 1 is not on its way"),
             (intent.withdraw(7).unwrap_err(), "no revision 7"),
         ];
         for (error, part) in table {

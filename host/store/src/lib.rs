@@ -1,1 +1,36 @@
-//! Placeholder.
+//! The host's disk: components by digest, what shall run, the last records, secrets and small settings.
+//!
+//! Owns: the layout of the store's directory, the format of its rows, and how durable each of them is. Never: decides what
+//! runs, never touches the network, and never stands on the cycle's path: a record is offered to [`RecordWriter`] and
+//! written behind.
+//!
+//! ```text
+//! <dir>/                     0700
+//!   lock                     held while a process has the store open; names that process
+//!   host.redb                infos, intents, tombstones, last records, settings
+//!   components/<digest>.wasm the bytes, named by what they are
+//!   secrets/<name>           0600, 32 random bytes
+//! ```
+//!
+//! | what | durable when the call returns? | why |
+//! |---|---|---|
+//! | component, info, intent, tombstone, setting, secret | yes, fsync | people were told that it is done |
+//! | last record | no: within a second | the standbys hold newer ones; a sync per cycle would wear out the disk |
+//!
+//! All calls block on the disk. Async callers use a blocking thread. A wait for another writer is as long as that one's
+//! fsync: the operating system's bound, not ours.
+
+mod components;
+mod database;
+mod error;
+mod format;
+mod intents;
+mod records;
+mod settings;
+mod store;
+mod writer;
+
+pub use error::Error;
+pub use intents::Tombstone;
+pub use store::{FORMAT, Store};
+pub use writer::{RecordWriter, WriterCounts};
