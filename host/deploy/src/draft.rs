@@ -58,3 +58,15 @@ pub struct LoopDraft {
     #[serde(default)]
     pub policy: Policy,
 }
+
+/// A small change of a running loop: what is not named stays.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Change {
+    /// Parameters to set, by name.
+    #[serde(default)]
+    pub parameters: BTreeMap<String, f64>,
+    /// Another strategy.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub strategy: Option<Strategy>,
+}

@@ -117,6 +117,8 @@ pub struct ApplyEnd {
     pub unchanged: bool,
     /// How a change of a running loop went: hand-over and bump.
     pub hand_over: Option<HandOverView>,
+    /// Parameters of the old component that the new one does not have, or not with that value: left out of a swap.
+    pub dropped_parameters: Vec<String>,
 }
 
 /// How a state came over, as the committed record says.
@@ -181,4 +183,55 @@ pub struct CallEnd {
     pub step_ns: u64,
     /// Time until the answer, network included, in ns.
     pub total_ns: u64,
+}
+
+/// What this host counts, for metrics. Counts only grow until the process ends; the others are as of now.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Counters {
+    /// Hosts that are alive, this one included (as of now).
+    pub hosts_alive: u64,
+    /// Loops known to this host (as of now).
+    pub loops_known: u64,
+    /// Loops whose home is here (as of now).
+    pub loops_home: u64,
+    /// Loops held here, owned or standing by (as of now).
+    pub loops_held: u64,
+    /// Loops owned here (as of now).
+    pub loops_owned: u64,
+    /// Components in the library (as of now).
+    pub components: u64,
+    /// Records that reached this host, own ones included.
+    pub records: u64,
+    /// Cycles taken, over all loops whose home is here.
+    pub cycles_taken: u64,
+    /// Cycles lost.
+    pub cycles_lost: u64,
+    /// Cycles that the home itself came too late for.
+    pub cycles_skipped: u64,
+    /// Changes of ownership after a silence.
+    pub takeovers: u64,
+    /// Commits refused by the arbiter.
+    pub commits_refused: u64,
+    /// Components taken in.
+    pub uploads: u64,
+    /// Components refused.
+    pub uploads_refused: u64,
+    /// Changes of loops that ended well, at this home.
+    pub applies: u64,
+    /// Changes of loops that were refused, at this home.
+    pub applies_refused: u64,
+    /// Components fetched from other hosts.
+    pub fetches: u64,
+    /// Fetches that failed; every host that was asked counts.
+    pub fetches_failed: u64,
+    /// Fetched bytes whose digest was wrong.
+    pub fetches_corrupt: u64,
+    /// Revisions that could not be made ready here; each try counts.
+    pub prepares_failed: u64,
+    /// Requests from other hosts that were answered.
+    pub requests: u64,
+    /// Messages from other hosts that could not be read.
+    pub malformed: u64,
+    /// Messages for deploy that were dropped because its queue was full.
+    pub arrivals_dropped: u64,
 }
