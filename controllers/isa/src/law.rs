@@ -1,0 +1,211 @@
+//! The arithmetic of the ISA standard form: pure, without ports, clocks or bytes.
+//!
+//! With the error `e = r − y` (less the dead band), gain `K` (negative for direct action), `w = γr − y`:
+//!
+//! ```text
+//!   U = P + I + D + F          P = K(βr − y)          D = K·d,  Tf·d' + d = Td·w',  Tf = Td/N
+//!   Ti·I' = K·e + (H − U)      H = what the actuator holds          F = ff-gain · ff
+//! ```
+//! `H − U` is external reset: while the actuator does not hold what the law wants (a limit, a rate limit, a hand outside the
+//! sandbox), the integral follows the actuator with time constant Ti, so it never winds up. For β = 1, without D and F, it is
+//! the positive feedback of ISA-TR5.9-2023: the integral is the actuator's value through a first-order lag of time Ti,
+//! `Ti·I' = H − I`. P, D and F are taken out of the feedback, so that the standard form stays non-interacting and a unit step
+//! load costs exactly `∫e dt = Ti/K`.
+//!
+//! Between two samples the actuator holds its value, so the lag is advanced exactly (zero-order hold, [`lag_part`]):
+//!
+//! ```text
+//!   I_k = I_(k−1) + (H_k − U_(k−1) + K·e_(k−1)) · (1 − e^(−ΔT/Ti))
+//! ```
+//! `H_k`, read at step k, is what the actuator has held since step k−1: it belongs to `U_(k−1)` and `e_(k−1)`.
+//! d is advanced by backward difference ([`derivative`]). ΔT is the true time since the integral was advanced last;
+//! it is not given for a step whose measurement does not count (PIDPlus), and then I, d and y stay.
+//! Without integral action (Ti = 0) `I` is the bias: it returns to its parameter with time constant `balance-time` after a
+//! bumpless transfer, as `BAL_TIME` of the Foundation Fieldbus PID block does.
+//!
+//! ```text
+//!          manual, track-on                  automatic
+//!   New ────────────────────► Following ─────────────────► Running ◄─┐
+//!    │                           ▲  ▲ I = H − (P+D+F)       │  │     │ automatic: I as above
+//!    │                           └──┘                       │  └─────┘
+//!    │                           ▲      manual, track-on    │
+//!    │                           └──────────────────────────┘
+//!    └── automatic: y, d from this sample; I = H − (P+D+F) ──► Running
+//! ```
+//! The first automatic step from `New` or `Following` gives exactly what the actuator holds, whatever the error.
+//! Never: a panic; numbers out of range give a number out of range, which the glue refuses.
+
+use bumpless_sdk::blocks::{dead_band, derivative, lag_part, limit, rate_limit};
+use serde::{Deserialize, Serialize};
+
+use crate::tuning::Tuning;
+
+/// Where the law stands; see the picture above.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Phase {
+    /// Has seen no measurement yet.
+    New,
+    /// Something else decides the output, and the law follows it.
+    Following,
+    /// The law decides.
+    Running,
+}
+
+/// Who decides the output in a step.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Demand {
+    /// The law.
+    Automatic,
+    /// Somebody else; the output is this value.
+    Follow(f64),
+}
+
+/// What one step is about.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Sample {
+    /// Measurement y.
+    pub pv: f64,
+    /// Setpoint r.
+    pub setpoint: f64,
+    /// Feedforward, before its gain; 0 for none.
+    pub feedforward: f64,
+    /// What the actuator holds, H; none where it cannot be read.
+    pub held: Option<f64>,
+    /// Who decides.
+    pub demand: Demand,
+    /// Time since the step before, s; greater than 0.
+    pub dt_s: f64,
+    /// ΔT, s: time since the last measurement that counted, where this one counts.
+    pub elapsed_s: Option<f64>,
+}
+
+/// The state: everything that lasts from step to step.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Memory {
+    /// Where the law stands.
+    pub phase: Phase,
+    /// Last output; stands in for H where the actuator cannot be read.
+    pub output: f64,
+    /// I; the bias where Ti is 0.
+    pub integral: f64,
+    /// y after its filter.
+    pub pv: f64,
+    /// r of the last step.
+    pub setpoint: f64,
+    /// Feedforward of the last step, before its gain.
+    pub feedforward: f64,
+    /// d, without the gain.
+    pub derivative: f64,
+    /// r when d was advanced last.
+    pub derivative_setpoint: f64,
+    /// Time since the last measurement that counted, s.
+    pub waited_s: f64,
+}
+
+impl Memory {
+    /// A first state that starts from what the actuator holds.
+    #[must_use]
+    pub const fn new(track: f64) -> Self {
+        Self {
+            phase: Phase::New,
+            output: track,
+            integral: track,
+            pv: 0.0,
+            setpoint: 0.0,
+            feedforward: 0.0,
+            derivative: 0.0,
+            derivative_setpoint: 0.0,
+            waited_s: 0.0,
+        }
+    }
+
+    /// e, less the dead band.
+    const fn error(&self, t: &Tuning) -> f64 {
+        dead_band(self.setpoint - self.pv, t.dead_band)
+    }
+
+    /// P + D + F: everything but the integral.
+    ///
+    /// The dead band moves the measurement that P sees onto the setpoint, so that `r − y` is the banded error there too.
+    const fn rest(&self, t: &Tuning) -> f64 {
+        let banded_pv = self.setpoint - self.error(t);
+        t.gain * (t.beta * self.setpoint - banded_pv + self.derivative) + t.ff_gain * self.feedforward
+    }
+
+    /// Computes one step and gives the output, within its limits; in [`Demand::Follow`] exactly the value followed.
+    #[must_use]
+    pub fn step(&mut self, t: &Tuning, sample: &Sample) -> f64 {
+        let held = match sample.held {
+            Some(value) => value,
+            None => self.output,
+        };
+        if let (Phase::Running, Some(elapsed_s)) = (self.phase, sample.elapsed_s) {
+            // Uses the memory of the step before, to which `held` belongs: must come before `observe`.
+            self.integrate(t, held, elapsed_s);
+        }
+        self.observe(t, sample);
+        let rest = self.rest(t);
+        self.output = match (sample.demand, self.phase) {
+            (Demand::Follow(value), _) => {
+                self.phase = Phase::Following;
+                self.integral = value - rest;
+                value
+            }
+            (Demand::Automatic, Phase::Running) => {
+                let wanted = self.integral + rest;
+                let reached = rate_limit(wanted, held, t.out_rate_per_s, sample.dt_s);
+                limit(reached, t.out_low, t.out_high)
+            }
+            (Demand::Automatic, Phase::New | Phase::Following) => {
+                self.phase = Phase::Running;
+                self.integral = held - rest;
+                limit(held, t.out_low, t.out_high)
+            }
+        };
+        self.output
+    }
+
+    fn integrate(&mut self, t: &Tuning, held: f64, elapsed_s: f64) {
+        if t.ti_s > 0.0 {
+            let missing = held - (self.integral + self.rest(t));
+            self.integral += (missing + t.gain * self.error(t)) * lag_part(t.ti_s, elapsed_s);
+        } else {
+            self.integral += (t.bias - self.integral) * lag_part(t.balance_s, elapsed_s);
+        }
+    }
+
+    /// Takes the sample in: filter, derivative, setpoint, feedforward.
+    fn observe(&mut self, t: &Tuning, sample: &Sample) {
+        if self.phase == Phase::New {
+            self.pv = sample.pv;
+            self.derivative = 0.0;
+            self.derivative_setpoint = sample.setpoint;
+        } else if let Some(elapsed_s) = sample.elapsed_s {
+            let pv = self.pv + (sample.pv - self.pv) * lag_part(t.pv_filter_s, elapsed_s);
+            let change = t.gamma * (sample.setpoint - self.derivative_setpoint) - (pv - self.pv);
+            self.derivative = derivative(self.derivative, change, t.td_s, t.td_filter_s, elapsed_s);
+            self.derivative_setpoint = sample.setpoint;
+            self.pv = pv;
+        }
+        self.setpoint = sample.setpoint;
+        self.feedforward = sample.feedforward;
+    }
+
+    /// Something else decides the output and there is no measurement: follows, and forgets the measurement, so that the law
+    /// starts anew from the first good one.
+    pub const fn follow_blind(&mut self, value: f64) {
+        *self = Self::new(value);
+    }
+
+    /// Moves the integral so that the output under the new tuning is, for the last sample, what it was under the old.
+    pub const fn retune(&mut self, old: &Tuning, new: &Tuning) {
+        let wanted = self.integral + self.rest(old);
+        // d carries its time; without the change of scale, D would jump in the step after this one.
+        self.derivative = if old.td_s > 0.0 {
+            self.derivative * (new.td_s / old.td_s)
+        } else {
+            0.0
+        };
+        self.integral = wanted - self.rest(new);
+    }
+}

@@ -1,0 +1,15 @@
+//! What the ISA-form controllers share: the tables of ports and parameters, the tuning, the arithmetic and the glue.
+//!
+//! Owns the law of `pid` and `pidplus`; they differ only in *when* a measurement counts, which each says in its own `law.rs`.
+//! Because they share tables and memory, each takes over the other's state and goes on from it.
+//! Never: a component of its own.
+
+pub mod table;
+
+mod tuning;
+pub use tuning::{Action, Tuning};
+
+mod law;
+pub use law::{Demand, Memory, Phase, Sample};
+
+pub mod block;

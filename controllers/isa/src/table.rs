@@ -1,0 +1,151 @@
+//! Ports and parameters of the ISA-form controllers, and their handles.
+//!
+//! Names and meanings follow ISA-TR5.9-2023 (PID algorithms and performance) and the Foundation Fieldbus PID block
+//! (`BAL_TIME`, `FF_GAIN`, `TRK_IN_D`, `TRK_VAL`). Never: a value; those ride in the state.
+
+use bumpless_sdk::{Input, Output, Parameter, ParameterSpec, PortSpec};
+
+/// The ports.
+pub const PORTS: &[PortSpec] = &[
+    PortSpec::analog_input("pv", "", "Measurement, in the unit of the setpoint").required(),
+    PortSpec::analog_input("ff", "", "Feedforward: times ff-gain, added to the output"),
+    PortSpec::analog_input("track", "", "Value that the output follows while track-on is on"),
+    PortSpec::digital_input("track-on", "Makes the output follow the track input"),
+    PortSpec::analog_output("out", "", "To the actuator; its reading is what the actuator holds").required(),
+];
+
+/// Measurement.
+pub const PV: Input = Input::of(PORTS, "pv");
+/// Feedforward.
+pub const FF: Input = Input::of(PORTS, "ff");
+/// Value to follow.
+pub const TRACK: Input = Input::of(PORTS, "track");
+/// Follow it now?
+pub const TRACK_ON: Input = Input::of(PORTS, "track-on");
+/// To the actuator.
+pub const OUT: Output = Output::of(PORTS, "out");
+
+/// The parameters.
+pub const PARAMETERS: &[ParameterSpec] = &[
+    ParameterSpec::number(
+        "k",
+        "out/pv",
+        1.0,
+        0.0,
+        1e6,
+        "Gain: output units per unit of the measurement",
+    ),
+    ParameterSpec::number("ti", "s", 60.0, 0.0, 1e6, "Integral time; 0 for no integral action"),
+    ParameterSpec::number("td", "s", 0.0, 0.0, 1e5, "Derivative time; 0 for no derivative action"),
+    ParameterSpec::number(
+        "n",
+        "",
+        10.0,
+        1.0,
+        100.0,
+        "Derivative filter: its time is td / n; usual are 5 to 20",
+    ),
+    ParameterSpec::number(
+        "beta",
+        "",
+        1.0,
+        0.0,
+        1.0,
+        "Part of the setpoint in the proportional action",
+    ),
+    ParameterSpec::number(
+        "gamma",
+        "",
+        0.0,
+        0.0,
+        1.0,
+        "Part of the setpoint in the derivative action",
+    ),
+    ParameterSpec::choice(
+        "action",
+        &["reverse", "direct"],
+        "reverse: a rising measurement lowers the output; direct: raises it",
+    ),
+    ParameterSpec::number("out-low", "out", 0.0, -1e9, 1e9, "Least output"),
+    ParameterSpec::number("out-high", "out", 100.0, -1e9, 1e9, "Greatest output"),
+    ParameterSpec::number(
+        "out-rate",
+        "out/s",
+        0.0,
+        0.0,
+        1e9,
+        "Greatest change of the output per second; 0 for no limit",
+    ),
+    ParameterSpec::number(
+        "dead-band",
+        "pv",
+        0.0,
+        0.0,
+        1e9,
+        "Errors up to this size, both ways, count as none",
+    ),
+    ParameterSpec::number(
+        "ff-gain",
+        "out/ff",
+        1.0,
+        -1e6,
+        1e6,
+        "Output units per unit of the feedforward",
+    ),
+    ParameterSpec::number("bias", "out", 50.0, -1e9, 1e9, "Output at no error, where ti is 0"),
+    ParameterSpec::number(
+        "balance-time",
+        "s",
+        60.0,
+        0.0,
+        1e6,
+        "Time constant with which the output returns to the bias after a bumpless transfer, where ti is 0",
+    ),
+    ParameterSpec::number(
+        "pv-filter",
+        "s",
+        0.0,
+        0.0,
+        1e5,
+        "Time constant of the filter on the measurement; 0 for none",
+    ),
+];
+
+macro_rules! handles {
+    ($($(#[$doc:meta])* $handle:ident = $name:literal;)*) => {
+        $($(#[$doc])* pub const $handle: Parameter = Parameter::of(PARAMETERS, $name);)*
+    };
+}
+
+handles! {
+    /// Gain.
+    K = "k";
+    /// Integral time.
+    TI = "ti";
+    /// Derivative time.
+    TD = "td";
+    /// Derivative filter.
+    N = "n";
+    /// Setpoint weight of P.
+    BETA = "beta";
+    /// Setpoint weight of D.
+    GAMMA = "gamma";
+    /// Direction.
+    ACTION = "action";
+    /// Least output.
+    OUT_LOW = "out-low";
+    /// Greatest output.
+    OUT_HIGH = "out-high";
+    /// Rate limit.
+    OUT_RATE = "out-rate";
+    /// Dead band.
+    DEAD_BAND = "dead-band";
+    /// Gain of the feedforward.
+    FF_GAIN = "ff-gain";
+    /// Bias without integral action.
+    BIAS = "bias";
+    /// Time of return to the bias.
+    BALANCE_TIME = "balance-time";
+    /// Measurement filter.
+    PV_FILTER = "pv-filter";
+}

@@ -1,0 +1,443 @@
+//! Builds every controller (`controllers/*`) and every test guest (`tests/guests/*`) into a component.
+//!
+//! ```text
+//!   cargo build --target wasm32-unknown-unknown ─► core module ─► wit-component ─► check of imports ─► target/components
+//! ```
+//! Owns the folder `target/components`: `<name>.wasm` for controllers, `guests/<name>.wasm` for guests; the name is the crate's
+//! folder. A crate takes part when it has a `cdylib` target. A component may import nothing but `bumpless:control@0.1.0`;
+//! a guest whose misdeed is another import says so with `[package.metadata.component] imports = "any"`.
+//! Safe to run from several processes at once: one works, the others wait and find the work done.
+//! Never: downloads anything but, through rustup, the compiler's own target.
+
+use std::{
+    fs, io,
+    io::Write as _,
+    path::{Path, PathBuf},
+    process::{Command, Stdio},
+};
+
+use bumpless_core::Digest;
+use serde::Deserialize;
+use wit_component::{ComponentEncoder, DecodedWasm};
+
+/// The target that brings no imports of its own.
+const TARGET: &str = "wasm32-unknown-unknown";
+
+/// The only package that a component may import from.
+const PACKAGE: &str = "bumpless:control@0.1.0";
+
+/// Cargo profile of components; see the root Cargo.toml.
+const PROFILE: &str = "component";
+
+/// Why components could not be built.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// A program is not there or cannot be run.
+    #[error("{program} cannot be run: install it and put it on the path")]
+    Program {
+        /// Its name.
+        program: &'static str,
+        /// What the system says.
+        source: io::Error,
+    },
+    /// A program ended badly.
+    #[error("`{command}` failed:\n{output}")]
+    Failed {
+        /// The command line.
+        command: String,
+        /// What it wrote to its error output.
+        output: String,
+    },
+    /// The target is missing, and rustup cannot add it.
+    #[error("the target {TARGET} is missing: `rustup target add {TARGET}` adds it")]
+    Target(#[source] Box<Error>),
+    /// Cargo's messages are not what is expected.
+    #[error("cargo wrote a message that cannot be read: use the Rust version of rust-toolchain or rust-version")]
+    Message(#[source] serde_json::Error),
+    /// A file or folder cannot be read or written.
+    #[error("{path}: cannot be {action}")]
+    File {
+        /// Which.
+        path: PathBuf,
+        /// "read", "written" or "locked".
+        action: &'static str,
+        /// What the system says.
+        source: io::Error,
+    },
+    /// wit-component refuses the module.
+    #[error("{name}: the module does not become a component: {reason}")]
+    Encode {
+        /// The component.
+        name: String,
+        /// In wit-component's words.
+        reason: String,
+    },
+    /// The component imports what the sandbox does not give.
+    #[error("{name} imports {import}, but only {PACKAGE} is given: remove what uses it")]
+    Import {
+        /// The component.
+        name: String,
+        /// The import.
+        import: String,
+    },
+    /// A crate that should have become a module did not.
+    #[error("cargo built no module for {0}")]
+    NoModule(String),
+}
+
+/// One component.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Built {
+    /// Folder name of the crate.
+    pub name: String,
+    /// Where the component is.
+    pub path: PathBuf,
+    /// Is it a guest for tests, not a stock controller?
+    pub guest: bool,
+    /// Its size.
+    pub bytes: u64,
+    /// Its digest.
+    pub digest: Digest,
+}
+
+#[derive(Deserialize)]
+struct Metadata {
+    packages: Vec<Package>,
+    target_directory: PathBuf,
+    workspace_root: PathBuf,
+}
+
+#[derive(Deserialize)]
+struct Package {
+    id: String,
+    name: String,
+    manifest_path: PathBuf,
+    targets: Vec<Target>,
+    metadata: Option<PackageMetadata>,
+}
+
+#[derive(Deserialize)]
+struct Target {
+    kind: Vec<String>,
+}
+
+#[derive(Deserialize, Default)]
+struct PackageMetadata {
+    component: Option<ComponentMetadata>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct ComponentMetadata {
+    imports: Imports,
+}
+
+#[derive(Deserialize, Clone, Copy, PartialEq, Eq)]
+#[serde(rename_all = "kebab-case")]
+enum Imports {
+    /// Imports are not checked.
+    Any,
+}
+
+/// One line of cargo's JSON output; other kinds of lines are passed over.
+#[derive(Deserialize)]
+struct Artifact {
+    reason: String,
+    package_id: Option<String>,
+    #[serde(default)]
+    filenames: Vec<PathBuf>,
+    #[serde(default)]
+    fresh: bool,
+}
+
+/// A crate that becomes a component.
+struct Source {
+    id: String,
+    package: String,
+    name: String,
+    guest: bool,
+    any_import: bool,
+}
+
+/// The workspace's root, as it was when this tool was built.
+fn workspace_root() -> &'static Path {
+    let own = Path::new(env!("CARGO_MANIFEST_DIR"));
+    own.parent().unwrap_or(own)
+}
+
+/// Builds what is not built yet. Gives the folder with the components.
+pub fn build() -> Result<PathBuf, Error> {
+    build_all().map(|(folder, _)| folder)
+}
+
+/// `cargo xtask components`: builds and prints a table.
+#[allow(clippy::print_stdout, reason = "a command-line tool speaks to its terminal")]
+pub fn run() -> Result<(), Error> {
+    let (folder, built) = build_all()?;
+    println!("{}", folder.display());
+    println!("{:<28} {:>8}  sha-256", "component", "bytes");
+    for c in &built {
+        let name = if c.guest {
+            format!("guests/{}", c.name)
+        } else {
+            c.name.clone()
+        };
+        println!("{name:<28} {:>8}  {}", c.bytes, c.digest);
+    }
+    Ok(())
+}
+
+/// Builds what is not built yet. Gives the folder and what is in it: controllers first, then guests, by name.
+pub fn build_all() -> Result<(PathBuf, Vec<Built>), Error> {
+    let metadata = metadata()?;
+    let sources = sources(&metadata);
+    let folder = metadata.target_directory.join("components");
+    let guests = folder.join("guests");
+    fs::create_dir_all(&guests).map_err(|source| Error::File {
+        path: guests.clone(),
+        action: "written",
+        source,
+    })?;
+
+    // Released when the file is closed, also when this process is killed.
+    let lock_path = folder.join(".lock");
+    let lock = fs::File::create(&lock_path)
+        .and_then(|file| file.lock().map(|()| file))
+        .map_err(|source| Error::File {
+            path: lock_path,
+            action: "locked",
+            source,
+        })?;
+    ensure_target()?;
+    let artifacts = cargo_build(&sources)?;
+    let built = sources
+        .iter()
+        .map(|source| componentize(source, &artifacts, &folder))
+        .collect::<Result<_, _>>()?;
+    drop(lock);
+    Ok((folder, built))
+}
+
+/// A command in the workspace's root, without what an outer `cargo` put into the environment: flags for the host would
+/// change the guests and make cargo build them anew.
+fn command(program: &str) -> Command {
+    let mut command = Command::new(program);
+    command.current_dir(workspace_root()).stdin(Stdio::null());
+    for name in [
+        "RUSTFLAGS",
+        "CARGO_ENCODED_RUSTFLAGS",
+        "RUSTC_WORKSPACE_WRAPPER",
+        "CARGO_BUILD_TARGET",
+    ] {
+        command.env_remove(name);
+    }
+    command
+}
+
+fn output(program: &'static str, command: &mut Command) -> Result<Vec<u8>, Error> {
+    let output = command.output().map_err(|source| Error::Program { program, source })?;
+    if output.status.success() {
+        return Ok(output.stdout);
+    }
+    Err(Error::Failed {
+        command: format!("{command:?}"),
+        output: String::from_utf8_lossy(&output.stderr).into_owned(),
+    })
+}
+
+fn metadata() -> Result<Metadata, Error> {
+    let text = output(
+        "cargo",
+        command("cargo").args(["metadata", "--no-deps", "--format-version", "1"]),
+    )?;
+    serde_json::from_slice(&text).map_err(Error::Message)
+}
+
+/// The crates with a `cdylib` under `controllers` and `tests/guests`: controllers first, then guests, by name.
+fn sources(metadata: &Metadata) -> Vec<Source> {
+    let mut sources: Vec<Source> = metadata
+        .packages
+        .iter()
+        .filter(|p| p.targets.iter().any(|t| t.kind.iter().any(|k| k == "cdylib")))
+        .filter_map(|p| {
+            let folder = p.manifest_path.parent()?;
+            let place = folder.strip_prefix(&metadata.workspace_root).ok()?.parent()?;
+            let guest = place == Path::new("tests/guests");
+            let name = folder.file_name()?.to_str()?.to_owned();
+            let component = p.metadata.as_ref().and_then(|m| m.component.as_ref());
+            let any_import = component.is_some_and(|c| c.imports == Imports::Any);
+            let ours = guest || place == Path::new("controllers");
+            ours.then(|| Source {
+                id: p.id.clone(),
+                package: p.name.clone(),
+                name,
+                guest,
+                any_import,
+            })
+        })
+        .collect();
+    sources.sort_by(|a, b| (a.guest, &a.name).cmp(&(b.guest, &b.name)));
+    sources
+}
+
+/// Adds the wasm target through rustup where the compiler does not have it.
+fn ensure_target() -> Result<(), Error> {
+    let text = output(
+        "rustc",
+        command("rustc").args(["--print", "target-libdir", "--target", TARGET]),
+    )?;
+    if Path::new(String::from_utf8_lossy(&text).trim()).is_dir() {
+        return Ok(());
+    }
+    output("rustup", command("rustup").args(["target", "add", TARGET]))
+        .map(drop)
+        .map_err(|e| Error::Target(Box::new(e)))
+}
+
+/// Builds the modules; gives for each package its module and whether it was up to date.
+fn cargo_build(sources: &[Source]) -> Result<Vec<(String, PathBuf, bool)>, Error> {
+    let mut cargo = command("cargo");
+    cargo.args([
+        "build",
+        "--target",
+        TARGET,
+        "--profile",
+        PROFILE,
+        "--lib",
+        "--message-format",
+        "json-render-diagnostics",
+    ]);
+    for source in sources {
+        cargo.args(["--package", &source.package]);
+    }
+    let text = output("cargo", &mut cargo)?;
+    let mut modules = Vec::new();
+    for line in text.split(|&byte| byte == b'\n').filter(|line| line.starts_with(b"{")) {
+        let artifact: Artifact = serde_json::from_slice(line).map_err(Error::Message)?;
+        if artifact.reason != "compiler-artifact" {
+            continue;
+        }
+        let module = artifact
+            .filenames
+            .into_iter()
+            .find(|f| f.extension().is_some_and(|e| e == "wasm"));
+        if let (Some(id), Some(module)) = (artifact.package_id, module) {
+            modules.push((id, module, artifact.fresh));
+        }
+    }
+    Ok(modules)
+}
+
+fn componentize(source: &Source, modules: &[(String, PathBuf, bool)], folder: &Path) -> Result<Built, Error> {
+    let (_, module, fresh) = modules
+        .iter()
+        .find(|(id, ..)| *id == source.id)
+        .ok_or_else(|| Error::NoModule(source.package.clone()))?;
+    let file = format!("{}.wasm", source.name);
+    let path = if source.guest {
+        folder.join("guests").join(file)
+    } else {
+        folder.join(file)
+    };
+    if !(*fresh && is_newer(&path, module)) {
+        let bytes = encode(source, &read(module)?)?;
+        write_whole(&path, &bytes)?;
+    }
+    let bytes = read(&path)?;
+    let digest = Digest::of(&bytes);
+    Ok(Built {
+        name: source.name.clone(),
+        path,
+        guest: source.guest,
+        bytes: bytes.len() as u64,
+        digest,
+    })
+}
+
+/// Was `path` written after `other`?
+fn is_newer(path: &Path, other: &Path) -> bool {
+    let time = |p: &Path| fs::metadata(p).and_then(|m| m.modified()).ok();
+    matches!((time(path), time(other)), (Some(a), Some(b)) if a >= b)
+}
+
+fn read(path: &Path) -> Result<Vec<u8>, Error> {
+    fs::read(path).map_err(|source| Error::File {
+        path: path.to_owned(),
+        action: "read",
+        source,
+    })
+}
+
+/// Writes beside the file, then renames: a reader sees the old or the new component, never a part of one.
+fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), Error> {
+    let beside = path.with_extension("wasm.new");
+    fs::File::create(&beside)
+        .and_then(|mut file| file.write_all(bytes))
+        .and_then(|()| fs::rename(&beside, path))
+        .map_err(|source| Error::File {
+            path: path.to_owned(),
+            action: "written",
+            source,
+        })
+}
+
+fn encode(source: &Source, module: &[u8]) -> Result<Vec<u8>, Error> {
+    let refused = |reason: String| Error::Encode {
+        name: source.name.clone(),
+        reason,
+    };
+    let bytes = ComponentEncoder::default()
+        .module(module)
+        .map(|encoder| encoder.validate(true))
+        .and_then(ComponentEncoder::encode)
+        .map_err(|e| refused(format!("{e:#}")))?;
+    if !source.any_import {
+        let imports = imports(&bytes).map_err(refused)?;
+        if let Some(import) = imports.into_iter().find(|i| package_of(i) != PACKAGE) {
+            return Err(Error::Import {
+                name: source.name.clone(),
+                import,
+            });
+        }
+    }
+    Ok(bytes)
+}
+
+/// What a component imports, by name.
+fn imports(component: &[u8]) -> Result<Vec<String>, String> {
+    let decoded = wit_component::decode(component).map_err(|e| format!("{e:#}"))?;
+    let DecodedWasm::Component(resolve, world) = decoded else {
+        return Err("it is an interface package, not a component".to_owned());
+    };
+    let world = resolve.worlds.get(world).ok_or("its world is missing")?;
+    Ok(world.imports.keys().map(|key| resolve.name_world_key(key)).collect())
+}
+
+/// `a:b@1` of `a:b/c@1`.
+fn package_of(import: &str) -> String {
+    match import.split_once('/') {
+        Some((package, rest)) => match rest.split_once('@') {
+            Some((_, version)) => format!("{package}@{version}"),
+            None => package.to_owned(),
+        },
+        None => import.to_owned(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_import_belongs_to_its_package_and_version() {
+        for (import, package) in [
+            ("bumpless:control/io@0.1.0", PACKAGE),
+            ("bumpless:control/io@0.2.0", "bumpless:control@0.2.0"),
+            ("bumpless:control/io", "bumpless:control"),
+            ("wasi:cli/environment@0.2.0", "wasi:cli@0.2.0"),
+            ("run", "run"),
+        ] {
+            assert_eq!(package_of(import), package, "{import}");
+        }
+    }
+}
