@@ -1,0 +1,185 @@
+//! The publishers of a session: declared once per (host, lane), per loop, and for the host's own news.
+//!
+//! Owns: the two caches and the quality of service of each lane. Never: blocks a sender; waits for the network.
+//!
+//! ```text
+//! lane                              priority     when the link is full
+//! sample answer step … ping pong    real time    drop: the cycle's deadline copes
+//! record                            real time    drop: in one queue with the samples, so that a record is not overtaken
+//! vitals notice                     data high    drop: the next one says more
+//! request and reply                 data low     block, on a thread that may wait
+//! ```
+//!
+//! A priority has one queue and one lock in Zenoh. So a lane that blocks shares its priority with no lane that drops.
+
+use std::{collections::HashMap, sync::Arc};
+
+use bumpless_core::{HostId, LoopId};
+use parking_lot::RwLock;
+use zenoh::{
+    Wait,
+    pubsub::Publisher,
+    qos::{CongestionControl, Priority},
+    sample::Locality,
+};
+
+use crate::{
+    error::Error,
+    keys::{Key, Keys, Lane},
+    limits::{HOSTS_MAX, RECORD_LANES_MAX},
+};
+
+/// The lanes to one host.
+#[derive(Debug)]
+struct HostLanes {
+    sample: Publisher<'static>,
+    answer: Publisher<'static>,
+    step: Publisher<'static>,
+    step_answer: Publisher<'static>,
+    ping: Publisher<'static>,
+    pong: Publisher<'static>,
+}
+
+impl HostLanes {
+    const fn get(&self, lane: Lane) -> &Publisher<'static> {
+        match lane {
+            Lane::Sample => &self.sample,
+            Lane::Answer => &self.answer,
+            Lane::Step => &self.step,
+            Lane::StepAnswer => &self.step_answer,
+            Lane::Ping => &self.ping,
+            Lane::Pong => &self.pong,
+        }
+    }
+}
+
+/// Every publisher of a session.
+#[derive(Debug)]
+pub(crate) struct Lanes {
+    keys: Keys,
+    host: HostId,
+    hosts: RwLock<HashMap<HostId, Arc<HostLanes>>>,
+    records: RwLock<HashMap<LoopId, Arc<Publisher<'static>>>>,
+    vitals: Publisher<'static>,
+    notice: Publisher<'static>,
+}
+
+impl Lanes {
+    pub(crate) fn new(zenoh: &zenoh::Session, keys: Keys, host: HostId) -> Result<Self, Error> {
+        let news = |key| declare(zenoh, keys.build(&key), Priority::DataHigh, Locality::Remote);
+        Ok(Self {
+            vitals: news(Key::Vitals(host.clone()))?,
+            notice: news(Key::Notice(host.clone()))?,
+            keys,
+            host,
+            hosts: RwLock::default(),
+            records: RwLock::default(),
+        })
+    }
+
+    /// Sends to one host. Its lanes are declared by the first call, if [`Lanes::warm`] did not come first.
+    pub(crate) fn direct(&self, zenoh: &zenoh::Session, to: &HostId, lane: Lane, bytes: Vec<u8>) -> Result<(), Error> {
+        put(self.host_lanes(zenoh, to)?.get(lane), lane.name(), bytes)
+    }
+
+    /// Sends a record to all.
+    pub(crate) fn record(&self, zenoh: &zenoh::Session, id: &LoopId, bytes: Vec<u8>) -> Result<(), Error> {
+        let cached = self.records.read().get(id).cloned();
+        let publisher = match cached {
+            Some(publisher) => publisher,
+            None => {
+                // Declared outside the lock, so that no other loop waits for it.
+                let key = self.keys.build(&Key::Record(id.clone()));
+                let publisher = Arc::new(declare(zenoh, key, Priority::RealTime, Locality::Remote)?);
+                let mut records = self.records.write();
+                if records.len() >= RECORD_LANES_MAX {
+                    return Err(Error::TooMany {
+                        what: "record lanes",
+                        limit: RECORD_LANES_MAX,
+                    });
+                }
+                records.entry(id.clone()).or_insert(publisher).clone()
+            }
+        };
+        put(&publisher, "record", bytes)
+    }
+
+    pub(crate) fn vitals(&self, bytes: Vec<u8>) -> Result<(), Error> {
+        put(&self.vitals, "vitals message", bytes)
+    }
+
+    pub(crate) fn notice(&self, bytes: Vec<u8>) -> Result<(), Error> {
+        put(&self.notice, "notice", bytes)
+    }
+
+    /// Declares the lanes to a host, so that no cycle has to.
+    pub(crate) fn warm(&self, zenoh: &zenoh::Session, to: &HostId) -> Result<(), Error> {
+        self.host_lanes(zenoh, to).map(drop)
+    }
+
+    /// Lets the lanes to a host go. They come back by themselves if they are used.
+    pub(crate) fn forget_host(&self, to: &HostId) {
+        // Undeclared when the value is dropped: after the lock.
+        let gone = self.hosts.write().remove(to);
+        drop(gone);
+    }
+
+    /// Lets the record lane of a loop go.
+    pub(crate) fn forget_loop(&self, id: &LoopId) {
+        let gone = self.records.write().remove(id);
+        drop(gone);
+    }
+
+    fn host_lanes(&self, zenoh: &zenoh::Session, to: &HostId) -> Result<Arc<HostLanes>, Error> {
+        if let Some(lanes) = self.hosts.read().get(to) {
+            return Ok(Arc::clone(lanes));
+        }
+        let lane = |lane| {
+            let key = self.keys.build(&Key::Direct {
+                to: to.clone(),
+                lane,
+                from: self.host.clone(),
+            });
+            declare(zenoh, key, Priority::RealTime, Locality::Any)
+        };
+        let lanes = Arc::new(HostLanes {
+            sample: lane(Lane::Sample)?,
+            answer: lane(Lane::Answer)?,
+            step: lane(Lane::Step)?,
+            step_answer: lane(Lane::StepAnswer)?,
+            ping: lane(Lane::Ping)?,
+            pong: lane(Lane::Pong)?,
+        });
+        let mut hosts = self.hosts.write();
+        if hosts.len() >= HOSTS_MAX && !hosts.contains_key(to) {
+            return Err(Error::TooMany {
+                what: "hosts",
+                limit: HOSTS_MAX,
+            });
+        }
+        Ok(Arc::clone(hosts.entry(to.clone()).or_insert(lanes)))
+    }
+}
+
+fn declare(
+    zenoh: &zenoh::Session,
+    key: String,
+    priority: Priority,
+    destination: Locality,
+) -> Result<Publisher<'static>, Error> {
+    // No `express`: it gains no latency here, costs several times the processor time, and loses messages.
+    zenoh
+        .declare_publisher(key.clone())
+        .congestion_control(CongestionControl::Drop)
+        .priority(priority)
+        .allowed_destination(destination)
+        .wait()
+        .map_err(|source| Error::Declare { key, source })
+}
+
+fn put(publisher: &Publisher<'static>, what: &'static str, bytes: Vec<u8>) -> Result<(), Error> {
+    publisher
+        .put(bytes)
+        .wait()
+        .map_err(|source| Error::Send { what, source })
+}
