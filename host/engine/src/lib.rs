@@ -1,1 +1,43 @@
-//! Placeholder.
+//! The sandbox: inspects, compiles, keeps and steps control components.
+//!
+//! Owns: wasmtime and everything that names it, the generated bindings, the compiled-code cache, the limits of a guest
+//! and the thread that stops one that spins.
+//! Never: knows loops, hosts, buses or the network; reads wall-clock time for a guest; lets a guest's misdeed become more
+//! than an [`Error`] or a [`Fault`](bumpless_core::Fault).
+//!
+//! ```text
+//! bytes ─ inspect ─▶ Inspection            (is it a controller? what does it say of itself?)
+//! bytes ─ prepare ─▶ Prepared (one per digest, shared)
+//!                       └─ instantiate ─▶ Instance (one per replica) ─ start / step / migrate ─▶ state, effects or fault
+//! ```
+//!
+//! Reading order: `config`, `engine`, `admission`, `prepared`, `instance`; below them `profile`, `compile` with
+//! `compile_child`, `cache`, `ticker`, `sandbox`, `imports`; `convert` alone joins generated types and the core's nouns.
+
+mod admission;
+mod bindings;
+mod cache;
+mod capacity;
+mod compile;
+pub mod compile_child;
+mod config;
+mod convert;
+mod engine;
+mod error;
+mod imports;
+mod instance;
+mod prepared;
+mod profile;
+mod sandbox;
+mod ticker;
+
+pub use admission::Inspection;
+pub use cache::cache_key;
+pub use capacity::Capacity;
+pub use compile::precompile;
+pub use config::{Compile, Config, Limits};
+pub use engine::Engine;
+pub use error::Error;
+pub use instance::{Instance, Origin};
+pub use prepared::Prepared;
+pub use profile::Profile;

@@ -1,0 +1,198 @@
+//! Is it a controller? The checks of a component's bytes, imports, exports and needs, before anything of it runs.
+//!
+//! Never: compiles or runs; `engine` does, between these checks.
+
+use std::time::Duration;
+
+use bumpless_core::{Descriptor, Digest};
+use wasmtime::component::{Component, types::ComponentItem};
+
+use crate::{
+    Error, Limits,
+    sandbox::{MEMORIES_MAX, TABLES_MAX},
+};
+
+/// The package of the interfaces.
+const PACKAGE: &str = "bumpless:control/";
+/// Interfaces that a controller may import.
+const OFFERED: [&str; 6] = ["types", "io", "timer", "net", "alarm", "log"];
+/// The interface that it must export, with its functions.
+const EXPORT: &str = "bumpless:control/control@0.1.0";
+const FUNCTIONS: [&str; 4] = ["describe", "start", "step", "migrate"];
+
+/// What an inspection found: a controller that can be prepared on this host.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Inspection {
+    /// Its name that nobody can forge.
+    pub digest: Digest,
+    /// What it says of itself, checked.
+    pub descriptor: Descriptor,
+    /// Interfaces that it imports, in its own order.
+    pub imports: Vec<String>,
+    /// Its size, in bytes.
+    pub bytes: usize,
+    /// Time of the compilation; none where compiled code was at hand.
+    pub compile_time: Option<Duration>,
+}
+
+/// The first bytes tell what kind of thing this is; and how big it may be.
+pub(crate) fn check_bytes(bytes: &[u8], limits: &Limits) -> Result<(), Error> {
+    if bytes.len() > limits.component_bytes_max {
+        return Err(Error::TooBig {
+            bytes: bytes.len(),
+            max: limits.component_bytes_max,
+        });
+    }
+    let not = |found, cure| Err(Error::NotComponent { found, cure });
+    if wasmtime::Engine::detect_precompiled(bytes).is_some() {
+        return not(
+            "machine code that wasmtime compiled",
+            "upload the .wasm file that it was made from",
+        );
+    }
+    // Preamble of the binary format: magic, version, layer; the component layer is 1 and a core module's is 0.
+    match bytes {
+        [] => not("an empty file", "upload the .wasm file of a component"),
+        [0, b'a', b's', b'm', _, _, 1, 0, ..] => Ok(()),
+        [0, b'a', b's', b'm', ..] => not(
+            "a core module",
+            "make a component of it, for example with wasm-tools component new",
+        ),
+        _ if bytes.trim_ascii_start().starts_with(b"(") => not(
+            "WebAssembly text",
+            "translate it first, for example with wasm-tools parse",
+        ),
+        _ => not("something else", "upload the .wasm file of a component"),
+    }
+}
+
+/// Names every import, and refuses those that are not offered.
+pub(crate) fn check_imports(component: &Component) -> Result<Vec<String>, Error> {
+    let ty = component.component_type();
+    let mut names = Vec::new();
+    for (name, _) in ty.imports(component.engine()) {
+        let interface = name
+            .strip_prefix(PACKAGE)
+            .map(|rest| rest.split('@').next().unwrap_or(rest));
+        if !interface.is_some_and(|i| OFFERED.contains(&i)) {
+            return Err(Error::Import {
+                name: name.chars().take(128).collect(),
+                cure: cure(name),
+            });
+        }
+        names.push(name.to_owned());
+    }
+    Ok(names)
+}
+
+fn cure(name: &str) -> &'static str {
+    if name.starts_with("wasi:") {
+        "a controller has no operating system: build it for wasm32-unknown-unknown, not for wasm32-wasip2"
+    } else if name.starts_with(PACKAGE) {
+        "this host does not know the interface; it may be of a newer version"
+    } else {
+        "a controller may import bumpless:control/{io, timer, net, alarm, log} only"
+    }
+}
+
+/// The export must be there and hold the functions; their types are checked when the bindings look them up.
+pub(crate) fn check_export(component: &Component) -> Result<(), Error> {
+    let world = |reason: String| Err(Error::World { reason });
+    let ty = component.component_type();
+    let engine = component.engine();
+    let found = ty.get_export(engine, EXPORT).map(|e| e.ty);
+    let Some(ComponentItem::ComponentInstance(instance)) = found else {
+        let exports: Vec<String> = ty
+            .exports(engine)
+            .take(8)
+            .map(|(name, _)| name.chars().take(64).collect())
+            .collect();
+        let exports = if exports.is_empty() {
+            "nothing".to_owned()
+        } else {
+            exports.join(", ")
+        };
+        return world(format!("it must export the interface {EXPORT}; it exports {exports}"));
+    };
+    for function in FUNCTIONS {
+        if !matches!(
+            instance.get_export(engine, function).map(|e| e.ty),
+            Some(ComponentItem::ComponentFunc(_))
+        ) {
+            return world(format!("its export {EXPORT} lacks the function {function}"));
+        }
+    }
+    Ok(())
+}
+
+/// Memories and tables within what an instance may have.
+pub(crate) fn check_needs(component: &Component, limits: &Limits) -> Result<(), Error> {
+    let needs = |reason: String| Err(Error::Needs { reason });
+    let Some(needed) = component.resources_required() else {
+        return needs("it imports core modules, so what it needs cannot be known".to_owned());
+    };
+    let pages_max = (limits.memory_bytes_max / (64 * 1024)) as u64;
+    if needed.num_memories as usize > MEMORIES_MAX {
+        return needs(format!(
+            "{} memories; at most {MEMORIES_MAX} are given",
+            needed.num_memories
+        ));
+    }
+    if needed.num_tables as usize > TABLES_MAX {
+        return needs(format!("{} tables; at most {TABLES_MAX} are given", needed.num_tables));
+    }
+    if let Some(pages) = needed.max_initial_memory_size.filter(|&pages| pages > pages_max) {
+        return needs(format!(
+            "{pages} pages of memory at the start; at most {pages_max} of 64 KiB are given"
+        ));
+    }
+    let elements_max = limits.table_elements_max as u64;
+    if let Some(elements) = needed
+        .max_initial_table_size
+        .filter(|&elements| elements > elements_max)
+    {
+        return needs(format!(
+            "a table of {elements} elements; at most {elements_max} are given"
+        ));
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "tests")]
+    use super::*;
+
+    #[test]
+    fn what_is_no_component_is_named() {
+        let cases: [(&[u8], &str); 5] = [
+            (
+                b"",
+                "this is no WebAssembly component but an empty file; upload the .wasm file of a component",
+            ),
+            (
+                b"\x7fELF",
+                "this is no WebAssembly component but something else; upload the .wasm file of a component",
+            ),
+            (
+                b"\0asm\x01\0\0\0",
+                "this is no WebAssembly component but a core module; make a component of it, for example with \
+                 wasm-tools component new",
+            ),
+            (
+                b"\n(component)",
+                "this is no WebAssembly component but WebAssembly text; translate it first, for example with \
+                 wasm-tools parse",
+            ),
+            (&[0; 65], "the component has 65 bytes; at most 64 are accepted"),
+        ];
+        let limits = Limits {
+            component_bytes_max: 64,
+            ..Limits::default()
+        };
+        for (bytes, expected) in cases {
+            assert_eq!(check_bytes(bytes, &limits).unwrap_err().to_string(), expected);
+        }
+        assert!(check_bytes(b"\0asm\x0d\0\x01\0", &limits).is_ok());
+    }
+}

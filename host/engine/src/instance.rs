@@ -1,0 +1,207 @@
+//! One replica's instance of a component: called once per cycle, remade after a failure.
+//!
+//! Owns: one store and its guest.
+//! Never: keeps a state between calls; it comes in with each call and goes out with it.
+//!
+//! ```text
+//!            call returns (ok, or a fault in the guest's words)
+//!          ┌──────────┐
+//!          ▼          │
+//!   ──▶ alive ────────┴─ trap, overrun or limit ──▶ dead ── next call: remade within that call's limit ──▶ alive
+//! ```
+
+use std::{
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use bumpless_core::{Effects, Fault, Frame, LogLevel};
+
+use crate::{
+    Prepared,
+    bindings::bumpless::control::types,
+    capacity::Place,
+    convert,
+    prepared::Live,
+    sandbox::{Call, Sandbox},
+};
+
+/// Where a state that is to be taken over comes from.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Origin {
+    /// Name of the component that wrote the state.
+    pub name: String,
+    /// Its version.
+    pub version: String,
+    /// Its state layout.
+    pub state_layout: u32,
+}
+
+/// An instance of a component. It can move between threads, and each thread that calls it needs 1 MiB of stack.
+///
+/// `limit_ns` bounds each call by the clock; the guest is stopped at the first tick after it, at most 1 ms later on an
+/// idle machine. A call that ends between its limit and the tick is good.
+pub struct Instance {
+    // Dropped in this order: the place is given back only when the store is gone.
+    live: Option<Live>,
+    prepared: Arc<Prepared>,
+    last_step_ns: u64,
+    _place: Place,
+}
+
+impl Instance {
+    pub(crate) fn new(prepared: Arc<Prepared>, live: Live, place: Place) -> Self {
+        Self {
+            live: Some(live),
+            prepared,
+            last_step_ns: 0,
+            _place: place,
+        }
+    }
+
+    /// The component.
+    #[must_use]
+    pub const fn prepared(&self) -> &Arc<Prepared> {
+        &self.prepared
+    }
+
+    /// Time of the last call, in ns, with the time of making the guest again where that was needed.
+    #[must_use]
+    pub const fn last_step_ns(&self) -> u64 {
+        self.last_step_ns
+    }
+
+    /// A first state. `parameters` holds one value per parameter and `track` what the actuator of each output port holds,
+    /// both in the descriptor's order.
+    ///
+    /// # Errors
+    /// Whatever the guest did wrong; it may be called again all the same.
+    pub fn start(&mut self, parameters: &[f64], track: &[f64], limit_ns: u64) -> Result<Vec<u8>, Fault> {
+        let state = self.call(limit_ns, |live| {
+            live.store.data_mut().open(Call::Start);
+            live.guest
+                .bumpless_control_control()
+                .call_start(&mut live.store, parameters, track)
+        })?;
+        self.report_log();
+        within_limit(state)
+    }
+
+    /// One step: the frame and the state go in, the effects with the next state come out, or nothing at all.
+    ///
+    /// A port without a reading in the frame counts as not connected.
+    ///
+    /// # Errors
+    /// Whatever the guest did wrong; it may be called again all the same.
+    pub fn step(&mut self, frame: &Frame, state: &[u8], limit_ns: u64) -> Result<Effects, Fault> {
+        let cycle = convert::cycle(frame, self.prepared.port_count());
+        let state = self.call(limit_ns, |live| {
+            live.store.data_mut().open_step(frame);
+            live.guest
+                .bumpless_control_control()
+                .call_step(&mut live.store, cycle, state)
+        })?;
+        let state = within_limit(state)?;
+        match &mut self.live {
+            Some(live) => Ok(live.store.data_mut().take_effects(state)),
+            // A call that returned a state leaves the guest alive.
+            None => Err(Fault::Trap("the instance was lost after its step".to_owned())),
+        }
+    }
+
+    /// Takes over a state that another component, another version or other parameters left. To decline
+    /// ([`Fault::BadState`]) is no failure: use [`Instance::start`] then.
+    ///
+    /// # Errors
+    /// Whatever the guest did wrong; it may be called again all the same.
+    pub fn migrate(
+        &mut self,
+        from: &Origin,
+        state: &[u8],
+        parameters: &[f64],
+        track: &[f64],
+        limit_ns: u64,
+    ) -> Result<Vec<u8>, Fault> {
+        let origin = convert::origin(from);
+        let state = self.call(limit_ns, |live| {
+            live.store.data_mut().open(Call::Migrate);
+            live.guest
+                .bumpless_control_control()
+                .call_migrate(&mut live.store, &origin, state, parameters, track)
+        })?;
+        self.report_log();
+        within_limit(state)
+    }
+
+    /// Calls the guest within a limit, making it first where the last call ended its life.
+    fn call(
+        &mut self,
+        limit_ns: u64,
+        run: impl FnOnce(&mut Live) -> wasmtime::Result<Result<Vec<u8>, types::Fault>>,
+    ) -> Result<Vec<u8>, Fault> {
+        let started = Instant::now();
+        let limit = Duration::from_nanos(limit_ns);
+        let deadline = started + limit;
+        if self.live.is_none() {
+            self.live = Some(self.prepared.make(deadline).map_err(|failed| failed.fault(limit))?);
+        }
+        let Some(live) = &mut self.live else {
+            return Err(Fault::Trap("the instance could not be made".to_owned()));
+        };
+        live.store.data_mut().deadline = deadline;
+        live.store.set_epoch_deadline(1);
+        let outcome = match run(live) {
+            Ok(Ok(state)) => Ok(state),
+            Ok(Err(said)) => Err(convert::fault(&said)),
+            Err(error) => {
+                let fault = live.store.data().fault(&error, limit_ns);
+                // wasmtime lets nobody into a store that has trapped, and a half-run guest must not go on anyway.
+                self.live = None;
+                Err(fault)
+            }
+        };
+        self.last_step_ns = u64::try_from(started.elapsed().as_nanos()).unwrap_or(u64::MAX);
+        outcome
+    }
+
+    /// Lines written outside a step have no record to travel in: they go to the host's own log.
+    fn report_log(&mut self) {
+        let Some(lines) = self
+            .live
+            .as_mut()
+            .map(|live| live.store.data_mut())
+            .map(Sandbox::take_log)
+        else {
+            return;
+        };
+        let component = &self.prepared.descriptor().name;
+        for line in lines {
+            match line.level {
+                LogLevel::Debug => tracing::debug!(%component, text = %line.text, "a component's line"),
+                LogLevel::Info => tracing::info!(%component, text = %line.text, "a component's line"),
+                LogLevel::Warning => tracing::warn!(%component, text = %line.text, "a component's line"),
+            }
+        }
+    }
+}
+
+impl std::fmt::Debug for Instance {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Instance")
+            .field("prepared", &self.prepared)
+            .field("alive", &self.live.is_some())
+            .field("last_step_ns", &self.last_step_ns)
+            .finish_non_exhaustive()
+    }
+}
+
+fn within_limit(state: Vec<u8>) -> Result<Vec<u8>, Fault> {
+    const MAX: usize = bumpless_core::limits::STATE_BYTES_MAX;
+    if state.len() > MAX {
+        return Err(Fault::Limit(format!(
+            "a state of {} bytes; at most {MAX} are kept",
+            state.len()
+        )));
+    }
+    Ok(state)
+}

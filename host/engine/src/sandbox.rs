@@ -1,0 +1,314 @@
+//! What a guest's store carries: what the guest may see in this call, what it has done so far, and its bounds.
+//!
+//! Owns: the buffers of one call, the bounds on memory and tables, and the reading of an engine error as a fault.
+//! Never: keeps anything of one call for the next, except the memory of its buffers.
+//!
+//! ```text
+//!            open_*(…)                 guest returns ok
+//!   empty ───────────────▶ in a call ───────────────────▶ take_effects ──▶ empty
+//!                              │ guest returns a fault: the buffers are cleared at the next opening
+//!                              └ trap, overrun or stop: the store with its sandbox is dropped
+//! ```
+
+use std::{collections::VecDeque, sync::Arc, time::Instant};
+
+use bumpless_core::{
+    AlarmChange, Cycle, Descriptor, Direction, Effects, Fault, Frame, LogLevel, LogLine, Message, Mode, Reading,
+    limits::{LOG_LINES_PER_STEP_MAX, PORTS_MAX, TEXT_CHARS_MAX},
+};
+use wasmtime::{ResourceLimiter, Trap, WasmBacktrace};
+
+use crate::config::Limits;
+
+/// Core instances, memories and tables of one component. A Rust component has 3, 1 and 2; composed ones have more.
+pub(crate) const CORE_INSTANCES_MAX: usize = 8;
+/// See [`CORE_INSTANCES_MAX`].
+pub(crate) const MEMORIES_MAX: usize = 2;
+/// See [`CORE_INSTANCES_MAX`].
+pub(crate) const TABLES_MAX: usize = 4;
+
+/// Bytes that one call may move from the guest to the host: the largest state with room for a descriptor's texts.
+pub(crate) const CALL_BYTES_MAX: usize = 256 * 1024;
+
+/// Which function of the guest runs. Only a step may have effects.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Call {
+    Describe,
+    Start,
+    Migrate,
+    Step,
+}
+
+/// A port as the imports need it.
+#[derive(Debug)]
+pub(crate) struct PortFace {
+    pub(crate) name: String,
+    pub(crate) is_output: bool,
+}
+
+/// The ports of a component, by number.
+pub(crate) fn faces(descriptor: &Descriptor) -> Arc<[PortFace]> {
+    descriptor
+        .ports
+        .iter()
+        .map(|p| PortFace {
+            name: p.name.clone(),
+            is_output: p.direction == Direction::Output,
+        })
+        .collect()
+}
+
+/// Data of a store.
+pub(crate) struct Sandbox {
+    memory_bytes_max: usize,
+    table_elements_max: usize,
+    /// What the guest asked for and did not get, in bytes or elements.
+    refused: Option<Refused>,
+    /// When the call must be over.
+    pub(crate) deadline: Instant,
+    pub(crate) call: Call,
+    pub(crate) ports: Arc<[PortFace]>,
+    pub(crate) cycle: Cycle,
+    pub(crate) readings: Vec<Reading>,
+    pub(crate) inbox: VecDeque<Message>,
+    /// Values written, by port number; valid where the bit in `written` is set.
+    pub(crate) values: [f64; PORTS_MAX],
+    pub(crate) written: u64,
+    pub(crate) messages: Vec<Message>,
+    pub(crate) alarms: Vec<AlarmChange>,
+    pub(crate) log: Vec<LogLine>,
+    pub(crate) lines_dropped: u64,
+}
+
+#[derive(Debug, Clone, Copy)]
+enum Refused {
+    Memory(usize),
+    Table(usize),
+}
+
+/// A fault that an import raises; it ends the call.
+#[derive(Debug, thiserror::Error)]
+#[error("the host stopped the call: {0}")]
+pub(crate) struct Stop(pub(crate) Fault);
+
+const NO_CYCLE: Cycle = Cycle {
+    seq: 0,
+    at_ns: 0,
+    dt_ns: 0,
+    mode: Mode::Manual,
+    setpoint: 0.0,
+};
+
+impl Sandbox {
+    pub(crate) fn new(limits: &Limits, ports: Arc<[PortFace]>, deadline: Instant) -> Self {
+        Self {
+            memory_bytes_max: limits.memory_bytes_max,
+            table_elements_max: limits.table_elements_max,
+            refused: None,
+            deadline,
+            call: Call::Describe,
+            ports,
+            cycle: NO_CYCLE,
+            readings: Vec::new(),
+            inbox: VecDeque::new(),
+            values: [0.0; PORTS_MAX],
+            written: 0,
+            messages: Vec::new(),
+            alarms: Vec::new(),
+            log: Vec::new(),
+            lines_dropped: 0,
+        }
+    }
+
+    /// Before any call but a step: nothing to see.
+    pub(crate) fn open(&mut self, call: Call) {
+        self.clear();
+        self.call = call;
+        self.cycle = NO_CYCLE;
+    }
+
+    /// Before a step. The readings' buffer is reused, so only messages cost an allocation.
+    pub(crate) fn open_step(&mut self, frame: &Frame) {
+        self.clear();
+        self.call = Call::Step;
+        self.cycle = frame.cycle;
+        self.readings.extend_from_slice(&frame.readings);
+        self.inbox.extend(frame.messages.iter().cloned());
+    }
+
+    fn clear(&mut self) {
+        self.refused = None;
+        self.readings.clear();
+        self.inbox.clear();
+        self.written = 0;
+        self.messages.clear();
+        self.alarms.clear();
+        self.log.clear();
+        self.lines_dropped = 0;
+    }
+
+    /// What a port reads; a port without a reading in the frame is not connected.
+    pub(crate) fn reading(&self, port: usize) -> Reading {
+        self.readings.get(port).copied().unwrap_or(Reading::unconnected())
+    }
+
+    /// Buffers a line; beyond the limit it is counted and dropped, for a chatty guest is a nuisance and not a fault.
+    pub(crate) fn push_line(&mut self, level: LogLevel, text: &str) {
+        if self.log.len() < LOG_LINES_PER_STEP_MAX {
+            self.log.push(LogLine { level, text: cut(text) });
+        } else {
+            self.lines_dropped += 1;
+        }
+    }
+
+    /// The effects of a step that returned `state`.
+    pub(crate) fn take_effects(&mut self, state: Vec<u8>) -> Effects {
+        let mut writes = Vec::with_capacity(self.written.count_ones() as usize);
+        for (port, value) in (0_u8..).zip(self.values) {
+            if self.written >> port & 1 == 1 {
+                writes.push((port, value));
+            }
+        }
+        Effects {
+            state,
+            writes,
+            messages: std::mem::take(&mut self.messages),
+            alarms: std::mem::take(&mut self.alarms),
+            log: self.take_log(),
+        }
+    }
+
+    /// The lines; where some were dropped, the last line kept gives way to one that says how many.
+    pub(crate) fn take_log(&mut self) -> Vec<LogLine> {
+        if self.lines_dropped > 0 {
+            self.log.truncate(LOG_LINES_PER_STEP_MAX - 1);
+            let dropped = self.lines_dropped + 1;
+            let text = format!("{dropped} more lines were dropped: at most {LOG_LINES_PER_STEP_MAX} per step are kept");
+            self.log.push(LogLine {
+                level: LogLevel::Warning,
+                text,
+            });
+        }
+        std::mem::take(&mut self.log)
+    }
+
+    /// What an engine error means. `limit_ns` is the limit that the call had.
+    pub(crate) fn fault(&self, error: &wasmtime::Error, limit_ns: u64) -> Fault {
+        if let Some(Stop(fault)) = error.downcast_ref::<Stop>() {
+            return fault.clone();
+        }
+        let trap = error.downcast_ref::<Trap>();
+        if trap == Some(&Trap::Interrupt) {
+            return Fault::Overrun {
+                limit_us: limit_ns / 1000,
+            };
+        }
+        match self.refused {
+            Some(Refused::Memory(bytes)) => {
+                let max = self.memory_bytes_max;
+                return Fault::Limit(format!("it asked for {bytes} bytes of memory; at most {max} are given"));
+            }
+            Some(Refused::Table(elements)) => {
+                let max = self.table_elements_max;
+                return Fault::Limit(format!(
+                    "it asked for a table of {elements} elements; at most {max} are given"
+                ));
+            }
+            None => {}
+        }
+        let root = error.root_cause().to_string();
+        // wasmtime keeps this error's type to itself, so its text is all there is to know it by.
+        if root.contains("fuel allocated for hostcalls") {
+            return Fault::Limit(format!("one call moved more than {CALL_BYTES_MAX} bytes to the host"));
+        }
+        let cause = trap.map_or(root, ToString::to_string);
+        let cause = cause.strip_prefix("wasm trap: ").unwrap_or(&cause);
+        let place = error
+            .downcast_ref::<WasmBacktrace>()
+            .and_then(|trace| trace.frames().iter().find_map(wasmtime::FrameInfo::func_name))
+            .map(|name| format!(" in {name}"))
+            .unwrap_or_default();
+        Fault::Trap(cut(&format!("{cause}{place}")))
+    }
+}
+
+/// At most as many characters as a text may have.
+pub(crate) fn cut(text: &str) -> String {
+    match text.char_indices().nth(TEXT_CHARS_MAX) {
+        Some((end, _)) => text[..end].to_owned(),
+        None => text.to_owned(),
+    }
+}
+
+impl ResourceLimiter for Sandbox {
+    fn memory_growing(&mut self, _current: usize, desired: usize, _maximum: Option<usize>) -> wasmtime::Result<bool> {
+        let fits = desired <= self.memory_bytes_max;
+        if !fits {
+            self.refused = Some(Refused::Memory(desired));
+        }
+        Ok(fits)
+    }
+
+    fn table_growing(&mut self, _current: usize, desired: usize, _maximum: Option<usize>) -> wasmtime::Result<bool> {
+        let fits = desired <= self.table_elements_max;
+        if !fits {
+            self.refused = Some(Refused::Table(desired));
+        }
+        Ok(fits)
+    }
+
+    fn instances(&self) -> usize {
+        CORE_INSTANCES_MAX
+    }
+
+    fn tables(&self) -> usize {
+        TABLES_MAX
+    }
+
+    fn memories(&self) -> usize {
+        MEMORIES_MAX
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "tests")]
+    use super::*;
+
+    fn sandbox() -> Sandbox {
+        Sandbox::new(&Limits::default(), Arc::from([]), Instant::now())
+    }
+
+    #[test]
+    fn texts_are_cut_at_characters() {
+        assert_eq!(cut("für"), "für");
+        let long = "ü".repeat(TEXT_CHARS_MAX + 1);
+        assert_eq!(cut(&long).chars().count(), TEXT_CHARS_MAX);
+    }
+
+    #[test]
+    fn dropped_lines_are_counted_within_the_limit() {
+        let mut sandbox = sandbox();
+        for i in 0..LOG_LINES_PER_STEP_MAX + 5 {
+            sandbox.push_line(LogLevel::Info, &i.to_string());
+        }
+        let log = sandbox.take_log();
+        assert_eq!(log.len(), LOG_LINES_PER_STEP_MAX);
+        assert_eq!(
+            log.last().unwrap().text,
+            "6 more lines were dropped: at most 16 per step are kept"
+        );
+        assert_eq!(log.first().unwrap().text, "0");
+    }
+
+    #[test]
+    fn writes_come_out_by_port_number() {
+        let mut sandbox = sandbox();
+        sandbox.values[63] = 2.0;
+        sandbox.values[0] = 1.0;
+        sandbox.written = 1 | 1 << 63;
+        assert_eq!(sandbox.take_effects(vec![]).writes, [(0, 1.0), (63, 2.0)]);
+        sandbox.open(Call::Start);
+        assert_eq!(sandbox.take_effects(vec![]).writes, []);
+    }
+}
