@@ -233,6 +233,7 @@ mod tests {
             strategy: Strategy::Local,
             replicas: 3,
             limits: BTreeMap::new(),
+            listens: Vec::new(),
             policy: Policy::default(),
         }
     }

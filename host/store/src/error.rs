@@ -82,6 +82,12 @@ pub enum Error {
         #[source]
         source: postcard::Error,
     },
+    /// A value whose row form cannot be read back.
+    #[error("{what} cannot be read back from its row, so it was not kept: report this, it is a fault of the program")]
+    Unreadable {
+        /// Which value.
+        what: String,
+    },
     /// A value over the limit.
     #[error("{what} has {bytes} bytes; 1 to {max} are possible")]
     Size {

@@ -46,10 +46,15 @@ impl Store {
     ///
     /// # Errors
     /// [`Error::Stale`] when a newer copy is held, [`Error::Removed`] for a copy from before the loop's removal,
-    /// [`Error::Io`], [`Error::Database`].
+    /// [`Error::Unreadable`], [`Error::Io`], [`Error::Database`].
     pub fn put_intent(&self, intent: &Intent) -> Result<(), Error> {
         let loop_id = &intent.loop_id;
-        let row = format::encode(|| format!("the intent of loop {loop_id:?}"), intent)?;
+        let what = || format!("the intent of loop {loop_id:?}");
+        let row = format::encode(what, intent)?;
+        // Before anything is promised: a row that cannot be read back would be a loop lost at the next start.
+        if decode_intent(&row).is_err() {
+            return Err(Error::Unreadable { what: what() });
+        }
         self.inner
             .base
             .write("write an intent to", Durability::Immediate, |txn| {

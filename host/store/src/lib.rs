@@ -34,3 +34,6 @@ pub use error::Error;
 pub use intents::Tombstone;
 pub use store::{FORMAT, Store};
 pub use writer::{RecordWriter, WriterCounts};
+
+#[cfg(test)]
+mod tests;

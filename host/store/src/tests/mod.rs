@@ -1,0 +1,10 @@
+//! Tests of the store against real files.
+
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "tests")]
+
+mod failing_disk;
+mod files;
+mod killed;
+mod rows;
+mod samples;
+mod writer;
