@@ -93,7 +93,9 @@ fn check<C: Controller>(parameters: &[f64], track: &[f64]) -> Result<(), Fault> 
     }
     for (spec, value) in d.parameters.iter().zip(parameters) {
         if !(spec.minimum..=spec.maximum).contains(value) {
-            return Err(Fault::BadParameter([spec.name, " is out of its range"].concat()));
+            let mut text = String::from(spec.name);
+            text.push_str(" is out of its range");
+            return Err(Fault::BadParameter(text));
         }
     }
     if track.len() != d.output_count() || !track.iter().all(|v| v.is_finite()) {

@@ -105,13 +105,25 @@ macro_rules! export {
         const _: () = <$controller as $crate::Controller>::DESCRIPTION.check();
 
         #[cfg(target_arch = "wasm32")]
-        #[allow(
-            unsafe_code,
-            reason = "the component model's exports are C functions; the generated code is their only user"
-)]
         const _: () = {
             type Component = $crate::glue::Glue<$controller>;
-            $crate::bindings::export_component!(Component with_types_in $crate::bindings);
+            $crate::export_unchecked!(Component);
+        };
+    };
+}
+
+/// Makes an implementation of the generated `Guest` trait the component of this crate, without any check.
+#[doc(hidden)]
+#[macro_export]
+macro_rules! export_unchecked {
+    ($guest:ident) => {
+        #[cfg(target_arch = "wasm32")]
+        #[allow(
+            unsafe_code,
+    reason = "the component model's exports are C functions; the generated code is their only user"
+        )]
+        const _: () = {
+            $crate::bindings::export_component!($guest with_types_in $crate::bindings);
         };
     };
 }
