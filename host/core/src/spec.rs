@@ -98,8 +98,9 @@ pub struct OutputLimit {
     pub low: f64,
     /// Greatest value.
     pub high: f64,
-    /// Greatest change per second; none for no limit.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    /// Greatest change per second; none for no limit. Always written: the wire and disk form has no field names, so a field
+    /// that is left out would shift all that follow.
+    #[serde(default)]
     pub rate_per_s: Option<f64>,
     /// Where the output goes when the policy says "safe value".
     pub safe: f64,
