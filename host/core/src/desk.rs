@@ -23,7 +23,7 @@ use crate::{
     name::HostId,
     protocol::{Answer, Refusal, Sample},
     reading::Reading,
-    record::{Applied, Command, Record},
+    record::{Applied, Command, CommandBody, Record},
     spec::LoopSpec,
     tick::{Fired, Tick},
 };
@@ -224,6 +224,15 @@ impl Desk {
         self.commands.len() < before
     }
 
+    /// The revision that the oldest waiting change asks for: its readings shall ride along.
+    #[must_use]
+    pub fn waiting_revision(&self) -> Option<u64> {
+        self.commands.iter().find_map(|c| match c.body {
+            CommandBody::Revise(revision) => Some(revision),
+            _ => None,
+        })
+    }
+
     /// A message for the loop; the oldest goes where too many wait, for a controller wants the newest.
     pub fn message(&mut self, message: Message) {
         if self.messages.len() >= MESSAGES_PER_STEP_MAX {
@@ -304,7 +313,8 @@ impl Desk {
     /// None where nothing is overdue.
     pub fn overdue(&mut self, now_ns: u64) -> Option<Dispatch> {
         let waiting = self.waiting.as_ref()?;
-        if now_ns < waiting.overdue_at_ns {
+        // At the next deadline the cycle is lost in any case; `deadline` closes it and passes the owner over.
+        if now_ns < waiting.overdue_at_ns || now_ns >= waiting.deadline_ns {
             return None;
         }
         if let Some(owner) = self.arbiter.owner().cloned() {
@@ -376,7 +386,7 @@ impl Desk {
 
     /// The part of the time left after which a silence counts.
     fn part_ns(&self, left_ns: u64) -> u64 {
-        (left_ns as f64 * self.spec.policy.takeover_part) as u64
+        ((left_ns as f64 * self.spec.policy.takeover_part) as u64).max(1)
     }
 
     fn owner_is_suspect(&self, now_ns: u64) -> bool {

@@ -314,7 +314,7 @@ impl StepResponse {
     /// Time from the step to the farthest point beyond the setpoint, in s; none without overshoot.
     #[must_use]
     pub fn peak_time_s(&self) -> Option<f64> {
-        (self.beyond > 0.0).then(|| self.peak_s - self.start_s)
+        (self.beyond > 0.0).then_some(self.peak_s - self.start_s)
     }
 
     /// Time from the step to the first sample of those that stayed in the band up to now, in s; none while it is outside.

@@ -88,6 +88,17 @@ pub enum Answer {
     },
 }
 
+impl Answer {
+    /// The loop that it is about.
+    #[must_use]
+    pub fn loop_id(&self) -> &LoopId {
+        match self {
+            Self::Commit(record) => &record.loop_id,
+            Self::NeedRecord { loop_id, .. } | Self::Decline { loop_id, .. } => loop_id,
+        }
+    }
+}
+
 /// Why the arbiter did not take a commit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, thiserror::Error)]
 pub enum Refusal {

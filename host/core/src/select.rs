@@ -153,6 +153,8 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
+    use crate::spec::Strategy as Choice;
+    use proptest::strategy::Strategy;
 
     fn candidate(n: usize, latency_ns: Option<u64>, cpu: f32, closed: bool, ready: bool) -> Candidate {
         Candidate { host: HostId::new(format!("h{n}")).expect("valid"), here: n == 0, ready, closed, latency_ns, cpu }
@@ -162,7 +164,7 @@ mod tests {
         LoopId::new("l").expect("valid")
     }
 
-    fn any_candidates() -> impl proptest::strategy::Strategy<Value = Vec<Candidate>> {
+    fn any_candidates() -> impl Strategy<Value = Vec<Candidate>> {
         prop::collection::vec((prop::option::of(0u64..50_000_000), 0.0f32..1.0, any::<bool>(), any::<bool>()), 0..12)
             .prop_map(|v| v.into_iter().enumerate().map(|(n, (l, c, o, r))| candidate(n, l, c, o, r)).collect())
     }
@@ -170,7 +172,7 @@ mod tests {
     proptest! {
         #[test]
         fn every_ready_replica_once_and_closed_ones_first(cs in any_candidates(), seq: u64, random: u64, s in 0usize..7) {
-            let order = select(Strategy::ALL[s], &cs, &loop_id(), seq, random);
+            let order = select(Choice::ALL[s], &cs, &loop_id(), seq, random);
             let mut sorted = order.clone();
             sorted.sort_unstable();
             prop_assert_eq!(sorted, (0..cs.len()).filter(|&i| cs[i].ready).collect::<Vec<_>>());
@@ -181,16 +183,16 @@ mod tests {
         fn the_overloaded_and_the_slow_are_left(seq: u64, random: u64) {
             let cs = [candidate(0, Some(300_000), 0.2, true, true), candidate(1, Some(400_000), 0.95, true, true),
                       candidate(2, Some(200_000), 0.3, true, true)];
-            prop_assert_ne!(select(Strategy::Cpu, &cs, &loop_id(), seq, random)[0], 1);
-            prop_assert_ne!(select(Strategy::P2c, &cs, &loop_id(), seq, random)[0], 1);
+            prop_assert_ne!(select(Choice::Cpu, &cs, &loop_id(), seq, random)[0], 1);
+            prop_assert_ne!(select(Choice::P2c, &cs, &loop_id(), seq, random)[0], 1);
             let cs = [candidate(0, Some(300_000), 0.2, true, true), candidate(1, Some(5_400_000), 0.2, true, true),
                       candidate(2, None, 0.3, true, true)];
-            prop_assert_ne!(select(Strategy::Latency, &cs, &loop_id(), seq, random)[0], 1);
+            prop_assert_ne!(select(Choice::Latency, &cs, &loop_id(), seq, random)[0], 1);
         }
 
         #[test]
         fn good_enough_ones_take_turns(s in 0usize..3, start in 0u64..1000) {
-            let strategy = [Strategy::RoundRobin, Strategy::Cpu, Strategy::Latency][s];
+            let strategy = [Choice::RoundRobin, Choice::Cpu, Choice::Latency][s];
             let cs: Vec<_> = (0..4).map(|n| candidate(n, Some(200_000 + n as u64), 0.1, true, true)).collect();
             let mut firsts: Vec<_> = (start..start + 4).map(|seq| select(strategy, &cs, &loop_id(), seq, 0)[0]).collect();
             firsts.sort_unstable();
