@@ -334,5 +334,4 @@ fn read<'a>(
 }
 
 #[cfg(test)]
-#[path = "inbox/tests.rs"]
 mod tests;

@@ -29,6 +29,14 @@ mod session;
 mod vitals;
 pub mod wire;
 
+// The tests inside and outside of this crate send the same messages; outside, it has this crate's name.
+#[cfg(test)]
+extern crate self as bumpless_cell;
+#[cfg(test)]
+#[path = "../tests/cell/nouns.rs"]
+#[allow(clippy::expect_used, reason = "tests")]
+mod nouns;
+
 pub use arrival::{Arrival, Sink};
 pub use config::Config;
 pub use counters::Counters;

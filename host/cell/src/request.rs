@@ -35,6 +35,7 @@ use zenoh::{
 use crate::{
     error::{Error, cut},
     limits::{REFUSAL_CHARS_MAX, REQUEST_BYTES_MAX, REQUEST_TIMEOUT_MS_MAX, REQUESTS_IN_FLIGHT_MAX},
+    session::Shared,
     wire::VERSION,
 };
 
@@ -180,7 +181,7 @@ fn version(what: &'static str, attachment: Option<&ZBytes>, length: usize) -> Re
 
 /// Asks a host, and waits.
 pub(crate) async fn ask(
-    zenoh: zenoh::Session,
+    shared: Arc<Shared>,
     key: String,
     to: &HostId,
     payload: Vec<u8>,
@@ -199,7 +200,8 @@ pub(crate) async fn ask(
     let sender = Mutex::new(Some(sender));
     // Sending a large payload waits for the link, so it does not happen on a thread of the runtime that others share.
     let sending = tokio::task::spawn_blocking(move || {
-        zenoh
+        shared
+            .zenoh()?
             .get(key)
             .payload(payload)
             .attachment(vec![VERSION])

@@ -231,7 +231,7 @@ impl Session {
             to: to.clone(),
             from: inbox.host.clone(),
         });
-        request::ask(self.shared.zenoh()?.clone(), key, to, payload, timeout).await
+        request::ask(Arc::clone(&self.shared), key, to, payload, timeout).await
     }
 
     /// Leaves the cell: the others see this host go at once. Every clone is closed with it.
@@ -267,7 +267,7 @@ impl Session {
 }
 
 impl Shared {
-    fn zenoh(&self) -> Result<&zenoh::Session, Error> {
+    pub(crate) fn zenoh(&self) -> Result<&zenoh::Session, Error> {
         self.zenoh.as_ref().ok_or_else(|| Error::Closed {
             host: self.inbox.host.clone(),
         })

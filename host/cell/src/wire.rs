@@ -48,6 +48,11 @@ impl Letter for Sample {
     const BYTES_MAX: usize = CYCLE_BYTES_MAX;
     fn check(&self) -> Result<(), String> {
         at_most("readings", self.readings.len(), PORTS_MAX)?;
+        at_most(
+            "next readings",
+            self.next_readings.as_ref().map_or(0, |(_, next)| next.len()),
+            PORTS_MAX,
+        )?;
         self.resume.as_deref().map_or(Ok(()), Letter::check)
     }
 }
@@ -175,3 +180,6 @@ pub fn decode<L: Letter>(bytes: &[u8]) -> Result<L, Error> {
     letter.check().map_err(undecodable)?;
     Ok(letter)
 }
+
+#[cfg(test)]
+mod tests;
