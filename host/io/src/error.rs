@@ -1,0 +1,69 @@
+//! The one error of this room. Each message names the place and the cure.
+
+use std::path::PathBuf;
+
+use bumpless_core::PointId;
+
+/// What can go wrong with points and buses.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The configuration cannot be used.
+    #[error("{place}: {problem}")]
+    Config {
+        /// Which bus or point, for example `bus "plant"` or `bus "line", point "line.out"`.
+        place: String,
+        /// What is wrong and what would be right.
+        problem: String,
+    },
+    /// The journal's file cannot be made.
+    #[error("bus {bus:?}: the journal {path:?} cannot be opened for writing; check the folder and its rights")]
+    Journal {
+        /// The bus.
+        bus: String,
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// A point number that this server never gave out.
+    #[error("point number {0} does not exist on this host; ask for its index again")]
+    UnknownPoint(u32),
+    /// A write to an input.
+    #[error("point {0} is an input and cannot be written; connect the output port to a writable point")]
+    NotWritable(PointId),
+    /// A write of NaN or infinity.
+    #[error("point {point}: {value} is no number to write; nothing was written")]
+    NotFinite {
+        /// The point.
+        point: PointId,
+        /// The value as text.
+        value: String,
+    },
+    /// A write outside the point's range.
+    #[error("point {point}: {value} {unit} is outside {low} to {high}; nothing was written")]
+    OutOfRange {
+        /// The point.
+        point: PointId,
+        /// The value.
+        value: f64,
+        /// The point's unit.
+        unit: String,
+        /// Least value.
+        low: f64,
+        /// Greatest value.
+        high: f64,
+    },
+    /// A write after the end.
+    #[error("the I/O of this host is closed; nothing was written")]
+    Closed,
+}
+
+impl Error {
+    /// A configuration error at a place.
+    pub(crate) fn config(place: impl Into<String>, problem: impl Into<String>) -> Self {
+        Self::Config {
+            place: place.into(),
+            problem: problem.into(),
+        }
+    }
+}
