@@ -39,7 +39,7 @@ fn child() {
         held.commit(n).unwrap();
         store.put_intent(&held).unwrap();
         store.put_records(&[record("level-1", 1, n)]).unwrap();
-        if n % 4 == 0 {
+        if n.is_multiple_of(4) {
             store.sync().unwrap();
         }
         // One write, so the parent never reads half a line.

@@ -38,7 +38,7 @@ pub(crate) fn spec(name: &str, setpoint: f64) -> LoopSpec {
         mode: Mode::Automatic,
         strategy: Strategy::P2c,
         replicas: 3,
-        limits: BTreeMap::from([("output".into(), fast), ("valve".into(), slow)]),
+        limits: BTreeMap::from([("output".into(), free), ("valve".into(), slow)]),
         listens: vec!["alarms".into()],
         policy: Policy::default(),
     }
