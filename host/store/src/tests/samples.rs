@@ -16,15 +16,15 @@ pub(crate) fn host(name: &str) -> HostId {
 }
 
 pub(crate) fn spec(name: &str, setpoint: f64) -> LoopSpec {
-    let fast = OutputLimit {
+    let free = OutputLimit {
         low: 0.0,
         high: 100.0,
-        rate_per_s: Some(50.0),
+        rate_per_s: None,
         safe: 0.0,
     };
     let slow = OutputLimit {
         rate_per_s: Some(5.0),
-        ..fast
+        ..free
     };
     LoopSpec {
         id: loop_id(name),
