@@ -31,12 +31,13 @@ const LOOK_EVERY: Duration = Duration::from_millis(10);
 /// Words of the child that are read, in bytes; a panic with its backtrace would be more.
 const WORDS_BYTES_MAX: u64 = 8 * 1024;
 
-/// Compiles a component for the given profile. This is what the compiling child runs.
+/// Compiles a component for the given profile. This is what the compiling child runs. Of the limits only
+/// `memory_bytes_max` matters: code loads in engines with the same profile and the same greatest memory.
 ///
 /// # Errors
 /// [`Error::Compile`] where the bytes are no valid component, [`Error::Engine`] where the machine is not supported.
-pub fn precompile(wasm: &[u8], profile: Profile) -> Result<Vec<u8>, Error> {
-    compile_with(&profile.compiler()?, wasm)
+pub fn precompile(wasm: &[u8], profile: Profile, limits: &Limits) -> Result<Vec<u8>, Error> {
+    compile_with(&profile.compiler(limits)?, wasm)
 }
 
 /// Compiles with an engine that exists.
@@ -139,11 +140,12 @@ fn why(status: ExitStatus, words: &str, limits: &Limits) -> Option<Error> {
     const SIGBUS: i32 = 7;
     const SIGSEGV: i32 = 11;
     const SIGXCPU: i32 = 24;
+    // The last of these is how a thread is refused whose stack does not fit.
     let out_of_memory = [
         "memory allocation of",
         "Cannot allocate memory",
         "out of memory",
-        "os error 12",
+        "Resource temporarily unavailable",
     ]
     .iter()
     .any(|sign| words.contains(sign));

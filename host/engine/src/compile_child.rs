@@ -11,6 +11,7 @@ use rustix::process::{Resource, Rlimit, Signal, nice, set_parent_process_death_s
 use crate::{Error, Limits, Profile, compile::precompile};
 
 const PROFILE: &str = "BUMPLESS_COMPILE_PROFILE";
+const GUEST_MEMORY_BYTES: &str = "BUMPLESS_COMPILE_GUEST_MEMORY_BYTES";
 const MEMORY_BYTES: &str = "BUMPLESS_COMPILE_MEMORY_BYTES";
 const TIME_S: &str = "BUMPLESS_COMPILE_TIME_S";
 
@@ -18,9 +19,10 @@ const TIME_S: &str = "BUMPLESS_COMPILE_TIME_S";
 const OUTPUT_BYTES_MAX: u64 = 512 * 1024 * 1024;
 
 /// What the host tells its child, as environment variables.
-pub(crate) fn environment(profile: Profile, limits: &Limits) -> [(&'static str, String); 3] {
+pub(crate) fn environment(profile: Profile, limits: &Limits) -> [(&'static str, String); 4] {
     [
         (PROFILE, profile.name().to_owned()),
+        (GUEST_MEMORY_BYTES, limits.memory_bytes_max.to_string()),
         (MEMORY_BYTES, limits.compile_memory_bytes_max.to_string()),
         (TIME_S, limits.compile_time_max.as_secs().max(1).to_string()),
     ]
@@ -35,17 +37,20 @@ pub(crate) fn environment(profile: Profile, limits: &Limits) -> [(&'static str, 
 /// # Errors
 /// [`Error::File`] for the two paths, [`Error::Compile`] for the component, [`Error::Engine`] for the machine.
 pub fn run(wasm: &Path, out: &Path) -> Result<(), Error> {
-    let defaults = Limits::default();
+    let mut limits = Limits::default();
     let profile = env::var(PROFILE)
         .ok()
         .and_then(|name| Profile::named(&name))
         .unwrap_or(Profile::Pooled);
     let number = |name| env::var(name).ok().and_then(|text| text.parse::<u64>().ok());
-    let memory_bytes = number(MEMORY_BYTES).unwrap_or(defaults.compile_memory_bytes_max);
-    let time = number(TIME_S).map_or(defaults.compile_time_max, Duration::from_secs);
+    if let Some(bytes) = number(GUEST_MEMORY_BYTES).and_then(|bytes| usize::try_from(bytes).ok()) {
+        limits.memory_bytes_max = bytes;
+    }
+    let memory_bytes = number(MEMORY_BYTES).unwrap_or(limits.compile_memory_bytes_max);
+    let time = number(TIME_S).map_or(limits.compile_time_max, Duration::from_secs);
     confine(memory_bytes, time)?;
     let bytes = fs::read(wasm).map_err(Error::file("reading", wasm))?;
-    let code = precompile(&bytes, profile)?;
+    let code = precompile(&bytes, profile, &limits)?;
     fs::write(out, code).map_err(Error::file("writing", out))
 }
 

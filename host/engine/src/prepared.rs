@@ -9,7 +9,7 @@ use std::{
 
 use bumpless_core::{Descriptor, Digest, Fault};
 use wasmtime::{
-    Store, UpdateDeadline,
+    Store, Trap, UpdateDeadline,
     component::{Component, HasSelf, Linker},
 };
 
@@ -20,7 +20,7 @@ use crate::{
     capacity::{Places, Turnstile},
     convert,
     error::brief,
-    sandbox::{CALL_BYTES_MAX, Call, PortFace, Sandbox, faces},
+    sandbox::{CALL_BYTES_MAX, Call, PortFace, Sandbox, Stop, faces},
     ticker::Ticker,
 };
 
@@ -141,6 +141,20 @@ pub(crate) struct Failed {
 }
 
 impl Failed {
+    /// Why a component that was never instantiated before cannot be. The types of its functions are checked only when
+    /// the bindings take hold of them, so not every failure is the guest's doing.
+    fn at_first(&self, limit: Duration) -> Error {
+        if self.error.is::<Trap>() || self.error.is::<Stop>() {
+            return Error::Instantiate(self.fault(limit));
+        }
+        let reason = brief(&self.error);
+        if reason.contains("resource limit") {
+            Error::Needs { reason }
+        } else {
+            Error::World { reason }
+        }
+    }
+
     pub(crate) fn fault(&self, limit: Duration) -> Fault {
         self.sandbox
             .fault(&self.error, u64::try_from(limit.as_nanos()).unwrap_or(u64::MAX))
@@ -175,8 +189,7 @@ fn describe(core: &Core, pre: &ControllerPre<Sandbox>) -> Result<Descriptor, Err
     let limit = core.limits.describe_time_max;
     let _turn = core.inspections.enter(limit * 8)?;
     let deadline = Instant::now() + limit;
-    let mut live =
-        make(core, pre, Arc::from([]), deadline).map_err(|failed| Error::Instantiate(failed.fault(limit)))?;
+    let mut live = make(core, pre, Arc::from([]), deadline).map_err(|failed| failed.at_first(limit))?;
     live.store.data_mut().open(Call::Describe);
     match live.guest.bumpless_control_control().call_describe(&mut live.store) {
         Ok(said) => Ok(convert::descriptor(said)),

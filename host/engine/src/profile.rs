@@ -84,7 +84,7 @@ impl Profile {
     }
 
     /// Settings that decide about the code: the same in the host and in the compiling child.
-    fn code_settings(self) -> Config {
+    fn code_settings(self, limits: &Limits) -> Config {
         let mut config = Config::new();
         config
             // Deadlines: epochs, which cost less than fuel and need no accounting per instruction.
@@ -108,11 +108,11 @@ impl Profile {
             .guard_before_linear_memory(false);
         match self {
             // The base of a memory never moves. Accesses are checked against its size; reserving 4 GiB a piece would
-            // save the check but cost page tables for each instance.
+            // save the check but cost page tables for each instance, and address space that small machines lack.
             Self::Pooled => {
                 config
                     .memory_may_move(false)
-                    .memory_reservation(1 << 20)
+                    .memory_reservation(limits.memory_bytes_max as u64)
                     .memory_guard_size(1 << 16)
                     .memory_reservation_for_growth(0);
             }
@@ -129,15 +129,15 @@ impl Profile {
     }
 
     /// An engine that only compiles, with as many threads as the process may use.
-    pub(crate) fn compiler(self) -> Result<wasmtime::Engine, Error> {
-        let mut config = self.code_settings();
+    pub(crate) fn compiler(self, limits: &Limits) -> Result<wasmtime::Engine, Error> {
+        let mut config = self.code_settings(limits);
         config.parallel_compilation(true);
         engine(&config)
     }
 
     /// An engine that runs.
     pub(crate) fn runtime(self, instances_max: u32, limits: &Limits) -> Result<wasmtime::Engine, Error> {
-        let mut config = self.code_settings();
+        let mut config = self.code_settings(limits);
         // Where the host itself compiles it leaves the other cores to the cycles.
         config.parallel_compilation(false);
         if self == Self::Pooled {

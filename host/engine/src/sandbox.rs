@@ -164,10 +164,9 @@ impl Sandbox {
     /// The effects of a step that returned `state`.
     pub(crate) fn take_effects(&mut self, state: Vec<u8>) -> Effects {
         let mut writes = Vec::with_capacity(self.written.count_ones() as usize);
-        for (port, value) in (0_u8..).zip(self.values) {
-            if self.written >> port & 1 == 1 {
-                writes.push((port, value));
-            }
+        if self.written != 0 {
+            let values = (0_u8..).zip(self.values);
+            writes.extend(values.filter(|(port, _)| self.written >> port & 1 == 1));
         }
         Effects {
             state,

@@ -1,0 +1,225 @@
+//! Guests made from core modules in text form, and the frames that they are given.
+//!
+//! The base module is a law with one input (port 0, "in") and one output (port 1, "out"): the state is the sum of all
+//! inputs as 8 bytes, and the output is that sum. A test replaces the body of a function to make a guest misbehave.
+//! Addresses: 0..1024 return areas, 1024..4096 the descriptor, from 65,536 what `cabi_realloc` gives out.
+
+use std::sync::Arc;
+
+use bumpless_core::{Cycle, Frame, Mode, Reading};
+use bumpless_engine::{Config, Engine, Instance, Limits, Prepared};
+use wit_component::{ComponentEncoder, StringEncoding, embed_component_metadata};
+use wit_parser::Resolve;
+
+/// A second: longer than any honest guest here takes, also on a busy machine.
+pub(crate) const SECOND_NS: u64 = 1_000_000_000;
+
+/// What a test changes about the base module.
+#[derive(Clone)]
+pub(crate) struct Guest {
+    pub(crate) name: &'static str,
+    pub(crate) out_name: &'static str,
+    pub(crate) pages: u32,
+    pub(crate) start_section: &'static str,
+    pub(crate) describe: String,
+    pub(crate) start: String,
+    pub(crate) step: String,
+    pub(crate) migrate: String,
+    pub(crate) extra: String,
+}
+
+impl Guest {
+    /// The law that behaves.
+    pub(crate) fn good() -> Self {
+        Self {
+            name: "sum",
+            out_name: "out",
+            pages: 2,
+            start_section: "",
+            describe: "(i32.const 1024)".into(),
+            // The first state is 8 bytes at 512: the sum is what the actuator holds.
+            start: "(f64.store (i32.const 512) (f64.load (local.get $track)))
+                    (call $ok (i32.const 512) (i32.const 8))"
+                .into(),
+            step: GOOD_STEP.into(),
+            migrate: "(call $ok (local.get $state) (local.get $state_len))".into(),
+            extra: String::new(),
+        }
+    }
+
+    pub(crate) fn step(body: &str) -> Self {
+        Self {
+            step: body.into(),
+            ..Self::good()
+        }
+    }
+
+    /// Core module text → component bytes, by the interfaces in `wit/`.
+    pub(crate) fn build(&self) -> Vec<u8> {
+        let mut module = wat::parse_str(self.text()).expect("the guest's text");
+        let mut resolve = Resolve::default();
+        let wit = concat!(env!("CARGO_MANIFEST_DIR"), "/../../wit");
+        let (package, _) = resolve.push_path(wit).expect("wit/");
+        let world = resolve.select_world(&[package], Some("controller")).expect("world");
+        embed_component_metadata(&mut module, &resolve, world, StringEncoding::UTF8).expect("metadata");
+        ComponentEncoder::default()
+            .module(&module)
+            .expect("module")
+            .validate(true)
+            .encode()
+            .expect("component")
+    }
+
+    fn text(&self) -> String {
+        let Self {
+            pages,
+            start_section,
+            describe,
+            start,
+            step,
+            migrate,
+            extra,
+            ..
+        } = self;
+        let descriptor: String = self.descriptor().iter().map(|b| format!("\\{b:02x}")).collect();
+        format!(
+            r#"(module
+  (import "bumpless:control/io@0.1.0" "read" (func $read (param i32 i32)))
+  (import "bumpless:control/io@0.1.0" "write" (func $write (param i32 f64)))
+  (import "bumpless:control/io@0.1.0" "count" (func $count (result i32)))
+  (import "bumpless:control/io@0.1.0" "find" (func $find (param i32 i32 i32)))
+  (import "bumpless:control/timer@0.1.0" "now-ns" (func $now (result i64)))
+  (import "bumpless:control/timer@0.1.0" "since-last-step-ns" (func $since (result i64)))
+  (import "bumpless:control/net@0.1.0" "publish" (func $publish (param i32 i32 i32 i32)))
+  (import "bumpless:control/net@0.1.0" "receive" (func $receive (param i32)))
+  (import "bumpless:control/alarm@0.1.0" "raise" (func $raise (param i32 i32 i32 i32 i32)))
+  (import "bumpless:control/alarm@0.1.0" "clear" (func $clear (param i32 i32)))
+  (import "bumpless:control/log@0.1.0" "write" (func $log (param i32 i32 i32)))
+  (memory (export "memory") {pages})
+  (global $heap (mut i32) (i32.const 65536))
+  (data (i32.const 1024) "{descriptor}")
+  (func (export "cabi_realloc") (param i32 i32 i32) (param $bytes i32) (result i32)
+    (local $at i32)
+    (local.set $at (global.get $heap))
+    (global.set $heap (i32.and (i32.add (i32.add (local.get $at) (local.get $bytes)) (i32.const 15)) (i32.const -16)))
+    (local.get $at))
+  (func $ok (param $at i32) (param $len i32) (result i32)
+    (i32.store (i32.const 0) (i32.const 0))
+    (i32.store (i32.const 4) (local.get $at))
+    (i32.store (i32.const 8) (local.get $len))
+    (i32.const 0))
+  ;; A fault of the given case with the component's name as its text.
+  (func $fault (param $case i32) (result i32)
+    (i32.store (i32.const 0) (i32.const 1))
+    (i32.store (i32.const 4) (local.get $case))
+    (i32.store (i32.const 8) (i32.load (i32.const 1024)))
+    (i32.store (i32.const 12) (i32.load (i32.const 1028)))
+    (i32.const 0))
+  {extra}
+  (func (export "bumpless:control/control@0.1.0#describe") (result i32) {describe})
+  (func $start (export "bumpless:control/control@0.1.0#start")
+    (param $parameters i32) (param $parameters_len i32) (param $track i32) (param $track_len i32) (result i32)
+    {start})
+  (func $step (export "bumpless:control/control@0.1.0#step")
+    (param $seq i64) (param $time i64) (param $dt i64) (param $mode i32) (param $setpoint f64) (param $connected i64)
+    (param $state i32) (param $state_len i32) (result i32)
+    {step})
+  (func (export "bumpless:control/control@0.1.0#migrate")
+    (param $name i32) (param $name_len i32) (param $version i32) (param $version_len i32) (param $layout i32)
+    (param $state i32) (param $state_len i32)
+    (param $parameters i32) (param $parameters_len i32) (param $track i32) (param $track_len i32) (result i32)
+    {migrate})
+  (func (export "cabi_post_bumpless:control/control@0.1.0#start") (param i32) (global.set $heap (i32.const 65536)))
+  (func (export "cabi_post_bumpless:control/control@0.1.0#step") (param i32) (global.set $heap (i32.const 65536)))
+  (func (export "cabi_post_bumpless:control/control@0.1.0#migrate") (param i32) (global.set $heap (i32.const 65536)))
+  {start_section}
+)"#
+        )
+    }
+
+    /// The bytes of the descriptor record at address 1024, texts behind it.
+    fn descriptor(&self) -> Vec<u8> {
+        const AT: u32 = 1024;
+        // Descriptor 44 bytes, padded to 48; two ports of 32; one parameter of 56; then the texts.
+        let (ports, parameters) = (AT + 48, AT + 48 + 64);
+        let mut texts = Vec::new();
+        let mut text = |s: &str| {
+            let at = parameters + 56 + u32::try_from(texts.len()).unwrap();
+            texts.extend_from_slice(s.as_bytes());
+            [at.to_le_bytes(), u32::try_from(s.len()).unwrap().to_le_bytes()].concat()
+        };
+        let pair = |a: u32, b: u32| [a.to_le_bytes(), b.to_le_bytes()].concat();
+        let mut bytes = [
+            text(self.name),
+            text("1.2.3"),
+            text("a test guest"),
+            pair(ports, 2),
+            pair(parameters, 1),
+        ]
+        .concat();
+        bytes.extend_from_slice(&7_u32.to_le_bytes());
+        bytes.resize(48, 0);
+        for (name, direction) in [("in", 0_u8), (self.out_name, 1)] {
+            bytes.extend(text(name));
+            bytes.extend([direction, 0, 0, 0]);
+            bytes.extend(text("bar"));
+            bytes.extend([1, 0, 0, 0]);
+            bytes.extend(text(""));
+        }
+        bytes.extend([text("after"), text("")].concat());
+        for value in [1.0_f64, 0.0, 9.0] {
+            bytes.extend(value.to_le_bytes());
+        }
+        bytes.extend([pair(0, 0), text("")].concat());
+        bytes.extend(texts);
+        bytes
+    }
+}
+
+/// state += read(0).value; write(1, state)
+const GOOD_STEP: &str = "
+    (call $read (i32.const 0) (i32.const 256))
+    (f64.store (local.get $state) (f64.add (f64.load (local.get $state)) (f64.load (i32.const 256))))
+    (call $write (i32.const 1) (f64.load (local.get $state)))
+    (call $ok (local.get $state) (local.get $state_len))";
+
+/// An engine that compiles in this process and keeps nothing.
+pub(crate) fn engine() -> Engine {
+    engine_for(8)
+}
+
+pub(crate) fn engine_for(instances_max: u32) -> Engine {
+    // One second and not more: what a spinning guest takes is what a test takes.
+    Engine::new(Config {
+        instances_max,
+        limits: Limits::default(),
+        ..Config::default()
+    })
+    .expect("engine")
+}
+
+pub(crate) fn prepare(guest: &Guest) -> Arc<Prepared> {
+    engine().prepare(&guest.build()).expect("prepare")
+}
+
+pub(crate) fn instance(guest: &Guest) -> Instance {
+    prepare(guest).instantiate().expect("instantiate")
+}
+
+pub(crate) fn frame(input: f64) -> Frame {
+    Frame {
+        cycle: Cycle {
+            seq: 7,
+            at_ns: 5000,
+            dt_ns: 100,
+            mode: Mode::Automatic,
+            setpoint: 3.0,
+        },
+        readings: vec![Reading::good(input, 4000), Reading::good(0.0, 4000)],
+        messages: vec![],
+    }
+}
+
+pub(crate) fn state(sum: f64) -> Vec<u8> {
+    sum.to_le_bytes().to_vec()
+}
