@@ -392,15 +392,24 @@ fn encode(source: &Source, module: &[u8]) -> Result<Vec<u8>, Error> {
         .and_then(ComponentEncoder::encode)
         .map_err(|e| refused(format!("{e:#}")))?;
     if !source.any_import {
-        let imports = imports(&bytes).map_err(refused)?;
-        if let Some(import) = imports.into_iter().find(|i| package_of(i) != PACKAGE) {
-            return Err(Error::Import {
-                name: source.name.clone(),
-                import,
-            });
-        }
+        check_imports(&source.name, &bytes)?;
     }
     Ok(bytes)
+}
+
+/// A component may import from [`PACKAGE`] alone.
+fn check_imports(name: &str, component: &[u8]) -> Result<(), Error> {
+    let imports = imports(component).map_err(|reason| Error::Encode {
+        name: name.to_owned(),
+        reason,
+    })?;
+    match imports.into_iter().find(|import| package_of(import) != PACKAGE) {
+        Some(import) => Err(Error::Import {
+            name: name.to_owned(),
+            import,
+        }),
+        None => Ok(()),
+    }
 }
 
 /// What a component imports, by name.
@@ -426,7 +435,42 @@ fn package_of(import: &str) -> String {
 
 #[cfg(test)]
 mod tests {
+    #![allow(clippy::expect_used, reason = "tests")]
+
     use super::*;
+
+    /// Builds, so the first run takes as long as the compiler does.
+    #[test]
+    fn components_are_built_once_and_import_only_what_the_host_gives() {
+        let (folder, first) = build_all().expect("components build");
+        let names: Vec<&str> = first.iter().filter(|c| !c.guest).map(|c| c.name.as_str()).collect();
+        assert_eq!(names, ["on-off", "pid", "pidplus"]);
+        assert!(first.iter().any(|c| c.guest && c.name == "traps"));
+        for component in &first {
+            let bytes = fs::read(&component.path).expect("is there");
+            assert_eq!(Digest::of(&bytes), component.digest);
+            let allowed = check_imports(&component.name, &bytes);
+            if component.name == "forbidden-import" {
+                let text = allowed.expect_err("it wants a disk").to_string();
+                assert!(
+                    text.starts_with("forbidden-import imports outside:disk/files@1.0.0, but only"),
+                    "{text}"
+                );
+            } else {
+                allowed.expect("imports only ours");
+            }
+        }
+
+        let written = |c: &Built| fs::metadata(&c.path).and_then(|m| m.modified()).expect("has a time");
+        let before: Vec<_> = first.iter().map(written).collect();
+        let (again, second) = build_all().expect("components build");
+        assert_eq!((&folder, &first), (&again, &second));
+        assert_eq!(
+            before,
+            second.iter().map(written).collect::<Vec<_>>(),
+            "nothing is written twice"
+        );
+    }
 
     #[test]
     fn an_import_belongs_to_its_package_and_version() {

@@ -32,7 +32,8 @@
 //!    │                           └──────────────────────────┘
 //!    └── automatic: y, d from this sample; I = H − (P+D+F) ──► Running
 //! ```
-//! The first automatic step from `New` or `Following` gives exactly what the actuator holds, whatever the error.
+//! The first automatic step from `New` or `Following` gives exactly what the actuator holds, whatever the error, and D starts
+//! from rest.
 //! Never: a panic; numbers out of range give a number out of range, which the glue refuses.
 
 use bumpless_sdk::blocks::{dead_band, derivative, lag_part, limit, rate_limit};
@@ -183,7 +184,11 @@ impl Memory {
         } else if let Some(elapsed_s) = sample.elapsed_s {
             let pv = self.pv + (sample.pv - self.pv) * lag_part(t.pv_filter_s, elapsed_s);
             let change = t.gamma * (sample.setpoint - self.derivative_setpoint) - (pv - self.pv);
-            self.derivative = derivative(self.derivative, change, t.td_s, t.td_filter_s, elapsed_s);
+            self.derivative = match self.phase {
+                Phase::Running => derivative(self.derivative, change, t.td_s, t.td_filter_s, elapsed_s),
+                // Starts from rest: a D that was balanced at the transfer would fade after it and pull the output along.
+                Phase::New | Phase::Following => 0.0,
+            };
             self.derivative_setpoint = sample.setpoint;
             self.pv = pv;
         }
@@ -198,14 +203,12 @@ impl Memory {
     }
 
     /// Moves the integral so that the output under the new tuning is, for the last sample, what it was under the old.
+    ///
+    /// D keeps its size, and fades or grows to its new one with its filter; where it is switched off, the integral takes it.
     pub const fn retune(&mut self, old: &Tuning, new: &Tuning) {
         let wanted = self.integral + self.rest(old);
-        // d carries its time; without the change of scale, D would jump in the step after this one.
-        self.derivative = if old.td_s > 0.0 {
-            self.derivative * (new.td_s / old.td_s)
-        } else {
-            0.0
-        };
+        let has_derivative = new.td_s > 0.0 && new.gain != 0.0;
+        self.derivative = if has_derivative { self.derivative * (old.gain / new.gain) } else { 0.0 };
         self.integral = wanted - self.rest(new);
     }
 }

@@ -7,7 +7,9 @@ use bumpless_sdk::{
     bindings::exports::bumpless::control::control::{Descriptor, Guest, Origin},
 };
 
-struct DescribeSpins;
+/// The guest.
+#[derive(Debug)]
+pub struct DescribeSpins;
 
 impl Guest for DescribeSpins {
     fn describe() -> Descriptor {

@@ -7,7 +7,9 @@ use bumpless_sdk::{
     bindings::exports::bumpless::control::control::{Descriptor, Direction, Guest, Kind, Origin, Parameter, Port},
 };
 
-struct Lies;
+/// The guest.
+#[derive(Debug)]
+pub struct Lies;
 
 impl Guest for Lies {
     fn describe() -> Descriptor {

@@ -3,7 +3,7 @@
 //! Never: used outside tests.
 
 use bumpless_sdk::prelude::*;
-use guest_countdown::{Countdown, Misdeed};
+use guest_countdown::{Countdown, Misdeed, OUT};
 
 /// Uses the result of the inner call after it, so that no compiler turns this into a loop.
 #[allow(unconditional_recursion, reason = "the misdeed")]
@@ -18,12 +18,9 @@ impl Misdeed for Recurses {
     const NAME: &'static str = "recurses";
     const TEXT: &'static str = "Recurses without end";
 
-    fn strike(_: &Parameters<'_>, _: &mut Io<'_>, held: f64) -> Result<(), Fault> {
-        if deeper(0) == u64::MAX {
-            Err(Fault::failed("came back"))
-        } else {
-            Ok(drop(std::hint::black_box(held)))
-        }
+    fn strike(_: &Parameters<'_>, io: &mut Io<'_>, _: f64) -> Result<(), Fault> {
+        io.write(OUT, deeper(0) as f64);
+        Ok(())
     }
 }
 

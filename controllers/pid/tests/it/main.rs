@@ -1,0 +1,11 @@
+//! Tests of the PID law against plants, exact results and an independent reference table.
+//!
+//! `plant` has the simulated processes; `reference` the figures; `transfer` everything that must not bump; `limits` what
+//! holds for any numbers.
+
+#![allow(clippy::expect_used, clippy::unwrap_used, clippy::panic, reason = "tests")]
+
+mod limits;
+mod plant;
+mod reference;
+mod transfer;
