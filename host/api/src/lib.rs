@@ -1,1 +1,35 @@
-//! Placeholder.
+//! The cell's API over HTTP: REST, a live feed, metrics, and the one map from errors to answers.
+//!
+//! Owns: routes, what travels over them, their limits, and the OpenAPI document. It is the only room that names axum.
+//! Never: decides about a loop or a component, touches disk or bus, or lets a request wait without end. Whoever may reach
+//! its address may operate the cell, so it listens on loopback unless the configuration says otherwise.
+//!
+//! ```text
+//! connection ─► one of REQUESTS_MAX places ─► time limit of the route ─► extract ─► Cell (deploy) ─► types ─► JSON
+//!                       └ full: 503             └ over: 504               └ bad: 4xx   └ error: the map in `error`
+//! ```
+//! A change that has begun is finished even when its asker leaves.
+//!
+//! Reading order: `types`, `routes`, `server`; `error` has the map.
+
+pub mod limits;
+pub mod types;
+
+mod cell;
+mod error;
+mod extract;
+mod metrics;
+mod openapi;
+#[allow(
+    unused_qualifications,
+    reason = "utoipa writes `super::` before the query types of the routes"
+)]
+mod routes;
+mod server;
+
+#[cfg(test)]
+mod tests;
+
+pub use error::{Error, Problem};
+pub use openapi::openapi_json;
+pub use server::{Options, serve};

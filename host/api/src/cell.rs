@@ -1,0 +1,133 @@
+//! What the API asks of the cell, as a trait: the routes are tested against a cell that exists only in memory.
+//!
+//! Never: adds a decision; [`Deploy`] is the only implementation outside of tests.
+
+use std::{future::Future, pin::Pin, sync::Arc};
+
+use bumpless_core::{CommandBody, CommandId, ComponentInfo, Digest, HostId, LoopId, Record};
+use bumpless_deploy::{
+    ApplyEnd, Call, CallEnd, Change, CommandEnd, ComponentView, Counters, Deploy, Error, HostView, LoopDraft, LoopView,
+    PointView,
+};
+use tokio::sync::broadcast;
+
+/// An answer that comes later. It owns what it needs, so that it can be finished after the asker has left.
+pub(crate) type Answer<T> = Pin<Box<dyn Future<Output = Result<T, Error>> + Send>>;
+
+/// One host's part in the cell; see [`Deploy`] for what each method means.
+pub(crate) trait Cell: Send + Sync + 'static {
+    fn upload(&self, bytes: Vec<u8>, by: String, note: String) -> Answer<ComponentInfo>;
+    fn components(&self) -> Vec<ComponentView>;
+    fn resolve(&self, reference: &str) -> Result<ComponentInfo, Error>;
+    fn component_bytes(&self, digest: Digest) -> Answer<Vec<u8>>;
+    fn remove_component(&self, reference: String) -> Answer<()>;
+    fn apply(&self, draft: LoopDraft) -> Answer<ApplyEnd>;
+    fn loops(&self) -> Vec<LoopView>;
+    fn loop_view(&self, id: &LoopId) -> Result<LoopView, Error>;
+    fn command(&self, id: LoopId, command_id: Option<CommandId>, body: CommandBody) -> Answer<CommandEnd>;
+    fn swap(&self, id: LoopId, component: String) -> Answer<ApplyEnd>;
+    fn set(&self, id: LoopId, change: Change) -> Answer<ApplyEnd>;
+    fn rollback(&self, id: LoopId, revision: Option<u64>) -> Answer<ApplyEnd>;
+    fn delete(&self, id: LoopId) -> Answer<()>;
+    fn move_owner(&self, id: LoopId, to: HostId) -> Answer<()>;
+    fn hosts(&self) -> Vec<HostView>;
+    fn here(&self) -> HostId;
+    fn points(&self) -> Answer<Vec<PointView>>;
+    fn call(&self, call: Call) -> Answer<CallEnd>;
+    fn records(&self) -> broadcast::Receiver<Arc<Record>>;
+    fn counters(&self) -> Counters;
+}
+
+impl Cell for Deploy {
+    fn upload(&self, bytes: Vec<u8>, by: String, note: String) -> Answer<ComponentInfo> {
+        let deploy = self.clone();
+        Box::pin(async move { deploy.upload(bytes, &by, &note).await })
+    }
+
+    fn components(&self) -> Vec<ComponentView> {
+        self.components()
+    }
+
+    fn resolve(&self, reference: &str) -> Result<ComponentInfo, Error> {
+        self.resolve(reference)
+    }
+
+    fn component_bytes(&self, digest: Digest) -> Answer<Vec<u8>> {
+        let deploy = self.clone();
+        Box::pin(async move { deploy.component_bytes(&digest).await })
+    }
+
+    fn remove_component(&self, reference: String) -> Answer<()> {
+        let deploy = self.clone();
+        Box::pin(async move { deploy.remove_component(&reference).await })
+    }
+
+    fn apply(&self, draft: LoopDraft) -> Answer<ApplyEnd> {
+        let deploy = self.clone();
+        Box::pin(async move { deploy.apply(draft).await })
+    }
+
+    fn loops(&self) -> Vec<LoopView> {
+        self.loops()
+    }
+
+    fn loop_view(&self, id: &LoopId) -> Result<LoopView, Error> {
+        self.loop_view(id)
+    }
+
+    fn command(&self, id: LoopId, command_id: Option<CommandId>, body: CommandBody) -> Answer<CommandEnd> {
+        let deploy = self.clone();
+        Box::pin(async move { deploy.command(&id, command_id, body).await })
+    }
+
+    fn swap(&self, id: LoopId, component: String) -> Answer<ApplyEnd> {
+        let deploy = self.clone();
+        Box::pin(async move { deploy.swap(&id, &component).await })
+    }
+
+    fn set(&self, id: LoopId, change: Change) -> Answer<ApplyEnd> {
+        let deploy = self.clone();
+        Box::pin(async move { deploy.set(&id, change).await })
+    }
+
+    fn rollback(&self, id: LoopId, revision: Option<u64>) -> Answer<ApplyEnd> {
+        let deploy = self.clone();
+        Box::pin(async move { deploy.rollback(&id, revision).await })
+    }
+
+    fn delete(&self, id: LoopId) -> Answer<()> {
+        let deploy = self.clone();
+        Box::pin(async move { deploy.delete(&id).await })
+    }
+
+    fn move_owner(&self, id: LoopId, to: HostId) -> Answer<()> {
+        let deploy = self.clone();
+        Box::pin(async move { deploy.move_owner(&id, &to).await })
+    }
+
+    fn hosts(&self) -> Vec<HostView> {
+        self.hosts()
+    }
+
+    fn here(&self) -> HostId {
+        self.here().clone()
+    }
+
+    fn points(&self) -> Answer<Vec<PointView>> {
+        let deploy = self.clone();
+        Box::pin(async move { deploy.points().await })
+    }
+
+    fn call(&self, call: Call) -> Answer<CallEnd> {
+        let deploy = self.clone();
+        Box::pin(async move { deploy.call(call).await })
+    }
+
+    fn records(&self) -> broadcast::Receiver<Arc<Record>> {
+        self.records()
+    }
+
+    fn counters(&self) -> Counters {
+        self.counters()
+    }
+}

@@ -1,0 +1,60 @@
+//! Every bound of the API, with its unit and its reason.
+//!
+//! Never: a bound of the cell itself (those are `bumpless_core::limits`).
+
+use std::time::Duration;
+
+/// Bytes of a JSON body. The largest honest one is a call with 64 KiB of state, which base64 makes a third longer.
+pub const JSON_BYTES_MAX: usize = 256 * 1024;
+
+/// Requests that are worked on at once; more are refused at once with 503, so that a flood cannot pile up memory.
+pub const REQUESTS_MAX: usize = 128;
+
+/// Live feeds that are open at once. Each converts every record that it passes on.
+pub const FEEDS_MAX: usize = 64;
+
+/// Uploads whose bytes are in memory at once: at 32 MiB each, 128 MiB in all.
+pub const UPLOADS_MAX: usize = 4;
+
+/// Longest time of an ordinary request.
+pub const REQUEST_TIME_MAX: Duration = Duration::from_secs(30);
+
+/// Longest time of a call: whoever asks for a step has a cycle of his own to keep.
+pub const CALL_TIME_MAX: Duration = Duration::from_secs(5);
+
+/// Longest time of a change of a loop. The home gives its hosts 20 s to get ready and 30 s in all; the answer needs time
+/// to come back.
+pub const CHANGE_TIME_MAX: Duration = Duration::from_secs(40);
+
+/// Longest time of an upload: a slow line, then at most 60 s in the compiler.
+pub const UPLOAD_TIME_MAX: Duration = Duration::from_secs(150);
+
+/// Time that connections get to finish once the host stops.
+pub const STOP_TIME_MAX: Duration = Duration::from_secs(3);
+
+/// Pause after which a silent feed says that it is alive: below the 30 s after which many proxies close.
+pub const KEEP_ALIVE: Duration = Duration::from_secs(10);
+
+/// Time between two `hosts` events of a feed.
+pub const HOSTS_EVERY: Duration = Duration::from_secs(1);
+
+/// Loops of one feed's filter.
+pub const FEED_LOOPS_MAX: usize = 64;
+
+/// Loops of one answer of the list, where the asker names no number.
+pub const PAGE_DEFAULT: usize = 1_000;
+
+/// Loops of one answer of the list at most: some 10 MB of JSON.
+pub const PAGE_MAX: usize = 10_000;
+
+/// Loops that have metrics of their own; the totals count all of them. Prometheus keeps one series per loop and metric.
+pub const METRIC_LOOPS_MAX: usize = 2_000;
+
+/// Hosts that have histograms of their own; the steps of others are counted under `other`.
+pub const METRIC_HOSTS_MAX: usize = 256;
+
+/// Components whose port names are kept for the feed; the least useful are those of old records, so all go at once.
+pub const PORT_TABLES_MAX: usize = 1_024;
+
+/// Characters of a header that is for people (`x-note`, `x-by`).
+pub const NOTE_CHARS_MAX: usize = 512;

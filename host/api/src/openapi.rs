@@ -1,0 +1,73 @@
+//! The OpenAPI document, made from the routes and types, so that it cannot say anything else than the code.
+
+use utoipa::OpenApi;
+
+use crate::{
+    error::Problem,
+    routes::{components, hosts, live, loops, pages},
+    types,
+};
+
+#[derive(OpenApi)]
+#[openapi(
+    info(
+        title = "Bumpless",
+        description = "The API of a cell: upload control components, bind them to loops, swap them while they run, \
+                       command, watch. Every host answers for the whole cell. Errors are problem+json (RFC 9457)."
+    ),
+    paths(
+        components::list, components::upload, components::show, components::bytes, components::remove, components::call,
+        loops::list, loops::show, loops::apply, loops::remove, loops::set, loops::swap, loops::rollback, loops::move_owner,
+        loops::setpoint, loops::mode, loops::output,
+        hosts::list, hosts::points, live::feed,
+        pages::healthz, pages::readyz, pages::metrics, pages::openapi,
+    ),
+    components(schemas(Problem, types::Record, types::Hosts)),
+    tags(
+        (name = "components", description = "The library of control components"),
+        (name = "loops", description = "Controllers bound to points"),
+        (name = "commands", description = "What an operator asks of a running loop; answered when a committed record holds it"),
+        (name = "cell", description = "Hosts, points and the live feed"),
+        (name = "operation", description = "For supervisors and monitoring"),
+    )
+)]
+struct Document;
+
+/// The document as pretty JSON with a final newline: what `docs/openapi.json` holds.
+#[must_use]
+pub fn openapi_json() -> String {
+    // The document is strings and numbers, so it always serialises; the test below would see an empty one.
+    let mut text = Document::openapi().to_pretty_json().unwrap_or_default();
+    text.push('\n');
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "tests")]
+
+    use super::*;
+
+    #[test]
+    fn the_checked_in_document_is_the_code() {
+        let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/openapi.json");
+        let now = openapi_json();
+        if std::env::var_os("UPDATE_EXPECT").is_some() {
+            std::fs::write(path, &now).expect("docs/openapi.json can be written");
+        }
+        let kept = std::fs::read_to_string(path).unwrap_or_default();
+        assert!(
+            kept == now,
+            "docs/openapi.json is not what the code says: run `cargo xtask openapi`, or this test with UPDATE_EXPECT=1"
+        );
+    }
+
+    #[test]
+    fn every_route_is_in_the_document() {
+        let document: serde_json::Value = serde_json::from_str(&openapi_json()).expect("it is JSON");
+        let listed = document["paths"].as_object().expect("paths").len();
+        let routes = include_str!("routes.rs").matches(".route(").count();
+        // The page for people at "/" is no part of the API.
+        assert_eq!(listed, routes - 1);
+    }
+}

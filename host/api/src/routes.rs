@@ -1,0 +1,53 @@
+//! The routes by subject. Each handler reads, asks the cell once, and shapes the answer.
+//!
+//! Never: decides; what may be done is the cell's to say.
+
+pub(crate) mod components;
+pub(crate) mod hosts;
+pub(crate) mod live;
+pub(crate) mod loops;
+pub(crate) mod pages;
+
+use axum::{
+    Router,
+    routing::{get, post},
+};
+
+use crate::server::App;
+
+/// Everything that takes a place and has a time limit.
+pub(crate) fn all() -> Router<App> {
+    Router::new()
+        .route("/v1/components", get(components::list).post(components::upload))
+        .route(
+            "/v1/components/{reference}",
+            get(components::show).delete(components::remove),
+        )
+        .route("/v1/components/{reference}/bytes", get(components::bytes))
+        .route("/v1/components/{reference}/call", post(components::call))
+        .route("/v1/loops", get(loops::list))
+        .route(
+            "/v1/loops/{name}",
+            get(loops::show).put(loops::apply).delete(loops::remove),
+        )
+        .route("/v1/loops/{name}/setpoint", post(loops::setpoint))
+        .route("/v1/loops/{name}/mode", post(loops::mode))
+        .route("/v1/loops/{name}/output", post(loops::output))
+        .route("/v1/loops/{name}/set", post(loops::set))
+        .route("/v1/loops/{name}/swap", post(loops::swap))
+        .route("/v1/loops/{name}/rollback", post(loops::rollback))
+        .route("/v1/loops/{name}/move", post(loops::move_owner))
+        .route("/v1/hosts", get(hosts::list))
+        .route("/v1/points", get(hosts::points))
+        .route("/v1/live", get(live::feed))
+        .route("/metrics", get(pages::metrics))
+        .route("/openapi.json", get(pages::openapi))
+        .route("/", get(pages::index))
+}
+
+/// Is the host alive, is it ready?
+pub(crate) fn health() -> Router<App> {
+    Router::new()
+        .route("/healthz", get(pages::healthz))
+        .route("/readyz", get(pages::readyz))
+}

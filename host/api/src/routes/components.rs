@@ -1,0 +1,162 @@
+//! `/v1/components`: the library, and calls to its components.
+
+use axum::{
+    Json as JsonAnswer,
+    body::Body,
+    extract::State,
+    http::{HeaderMap, HeaderValue, StatusCode, header},
+    response::{IntoResponse as _, Response},
+};
+use bumpless_core::{ComponentInfo, limits::COMPONENT_BYTES_MAX};
+use bumpless_deploy::ComponentView;
+use serde::Deserialize;
+use utoipa::IntoParams;
+
+use crate::{
+    error::{Kind, Problem},
+    extract::{InPath, InQuery, Json, body_bytes, content_type, words},
+    server::{App, finish},
+    types::{CallAnswer, CallRequest, Component, Components},
+};
+
+/// The component with where it stands.
+fn seen(app: &App, info: ComponentInfo) -> Component {
+    let known = app
+        .cell
+        .components()
+        .into_iter()
+        .find(|view| view.info.digest == info.digest);
+    known
+        .unwrap_or_else(|| ComponentView {
+            info,
+            used_by: Vec::new(),
+            ready_on: Vec::new(),
+        })
+        .into()
+}
+
+/// Lists the library.
+#[utoipa::path(get, path = "/v1/components", tag = "components",
+    responses((status = 200, description = "The library, by name and version", body = Components)))]
+pub(crate) async fn list(State(app): State<App>) -> JsonAnswer<Components> {
+    JsonAnswer(Components {
+        components: app.cell.components().into_iter().map(Into::into).collect(),
+    })
+}
+
+/// What may be said about an upload.
+#[derive(Debug, Deserialize, IntoParams)]
+#[into_params(parameter_in = Query)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct UploadQuery {
+    /// A line about it, for people. The header `x-note` does the same.
+    note: Option<String>,
+    /// Who uploads it, for people. The header `x-by` does the same.
+    by: Option<String>,
+}
+
+/// Uploads a component: the raw bytes of a `.wasm` component, at most 32 MiB. It is inspected and compiled outside of this
+/// process before it is taken in.
+#[utoipa::path(post, path = "/v1/components", tag = "components", params(UploadQuery),
+    request_body(content = Vec<u8>, content_type = "application/wasm", description = "The component"),
+    responses(
+        (status = 201, description = "Taken in, or known already", body = Component),
+        (status = 409, description = "Same name and version with other bytes", body = Problem, content_type = "application/problem+json"),
+        (status = 413, description = "More than 32 MiB", body = Problem, content_type = "application/problem+json"),
+        (status = 422, description = "Not a component that may run here; says why", body = Problem, content_type = "application/problem+json"),
+        (status = "default", description = "Anything else", body = Problem, content_type = "application/problem+json")))]
+pub(crate) async fn upload(
+    State(app): State<App>,
+    InQuery(query): InQuery<UploadQuery>,
+    headers: HeaderMap,
+    body: Body,
+) -> Result<Response, Problem> {
+    content_type(&headers, &["application/wasm", "application/octet-stream"])?;
+    let note = words(query.note, &headers, "x-note")?;
+    let by = words(query.by, &headers, "x-by")?;
+    let by = if by.is_empty() { "api".to_owned() } else { by };
+    // Not even the first byte is read before there is room for all of them.
+    let _room = app.uploads.try_acquire().map_err(|_| {
+        Problem::new(
+            Kind::Busy,
+            "too many uploads are under way",
+            "try again in a few seconds",
+        )
+    })?;
+    let bytes = body_bytes(body, COMPONENT_BYTES_MAX).await?;
+    if bytes.is_empty() {
+        return Err(Problem::new(
+            Kind::Invalid,
+            "the body is empty",
+            "send the bytes of a .wasm component",
+        ));
+    }
+    let info = finish(app.cell.upload(bytes, by, note)).await?;
+    let location = HeaderValue::from_str(&format!("/v1/components/{}", info.digest)).ok();
+    let mut response = (StatusCode::CREATED, JsonAnswer(seen(&app, info))).into_response();
+    if let Some(location) = location {
+        response.headers_mut().insert(header::LOCATION, location);
+    }
+    Ok(response)
+}
+
+/// Shows one component. `reference` is `name` (the newest version), `name@version`, or a digest or its first 8 digits.
+#[utoipa::path(get, path = "/v1/components/{reference}", tag = "components", params(("reference" = String, Path)),
+    responses(
+        (status = 200, description = "The component", body = Component),
+        (status = "default", description = "What went wrong", body = Problem, content_type = "application/problem+json")))]
+pub(crate) async fn show(
+    State(app): State<App>,
+    InPath(reference): InPath<String>,
+) -> Result<JsonAnswer<Component>, Problem> {
+    let info = app.cell.resolve(&reference)?;
+    Ok(JsonAnswer(seen(&app, info)))
+}
+
+/// Downloads a component's bytes.
+#[utoipa::path(get, path = "/v1/components/{reference}/bytes", tag = "components", params(("reference" = String, Path)),
+    responses(
+        (status = 200, description = "The component's bytes", body = Vec<u8>, content_type = "application/wasm"),
+        (status = "default", description = "What went wrong", body = Problem, content_type = "application/problem+json")))]
+pub(crate) async fn bytes(State(app): State<App>, InPath(reference): InPath<String>) -> Result<Response, Problem> {
+    let info = app.cell.resolve(&reference)?;
+    let bytes = app.cell.component_bytes(info.digest).await?;
+    // A descriptor's name and version are letters, digits, dashes and dots, so they are safe in a header.
+    let name = format!("attachment; filename=\"{}-{}.wasm\"", info.name, info.version);
+    let mut response = ([(header::CONTENT_TYPE, "application/wasm")], bytes).into_response();
+    if let Ok(name) = HeaderValue::from_str(&name) {
+        response.headers_mut().insert(header::CONTENT_DISPOSITION, name);
+    }
+    if let Ok(tag) = HeaderValue::from_str(&format!("\"{}\"", info.digest)) {
+        response.headers_mut().insert(header::ETAG, tag);
+    }
+    Ok(response)
+}
+
+/// Removes a component from the library of the cell. Refused while a loop uses it.
+#[utoipa::path(delete, path = "/v1/components/{reference}", tag = "components", params(("reference" = String, Path)),
+    responses(
+        (status = 204, description = "Removed"),
+        (status = 409, description = "A loop uses it", body = Problem, content_type = "application/problem+json"),
+        (status = "default", description = "What went wrong", body = Problem, content_type = "application/problem+json")))]
+pub(crate) async fn remove(State(app): State<App>, InPath(reference): InPath<String>) -> Result<StatusCode, Problem> {
+    finish(app.cell.remove_component(reference)).await?;
+    Ok(StatusCode::NO_CONTENT)
+}
+
+/// Runs one step of a component on a host of the cell: the cell as a control service. The state goes back and forth.
+#[utoipa::path(post, path = "/v1/components/{reference}/call", tag = "components", params(("reference" = String, Path)),
+    request_body = CallRequest,
+    responses(
+        (status = 200, description = "The step's outputs and state", body = CallAnswer),
+        (status = "default", description = "What went wrong", body = Problem, content_type = "application/problem+json")))]
+pub(crate) async fn call(
+    State(app): State<App>,
+    InPath(reference): InPath<String>,
+    Json(request): Json<CallRequest>,
+) -> Result<JsonAnswer<CallAnswer>, Problem> {
+    let call = request
+        .into_call(reference)
+        .map_err(|why| Problem::new(Kind::Invalid, why, ""))?;
+    Ok(JsonAnswer(app.cell.call(call).await?.into()))
+}

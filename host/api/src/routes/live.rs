@@ -1,0 +1,191 @@
+//! `/v1/live`: records as server-sent events, as they leave the arbiters.
+//!
+//! A feed never holds the cell up: whoever reads too slowly loses the oldest records and is told how many (`lost`).
+
+use std::{
+    collections::{HashMap, HashSet},
+    convert::Infallible,
+    sync::Arc,
+};
+
+use axum::{
+    extract::State,
+    http::HeaderName,
+    response::{
+        IntoResponse,
+        sse::{Event, KeepAlive, Sse},
+    },
+};
+use bumpless_core::{LoopId, Record as CoreRecord};
+use futures_util::stream;
+use serde::Deserialize;
+use tokio::{
+    sync::{
+        OwnedSemaphorePermit,
+        broadcast::{self, error::RecvError},
+        watch,
+    },
+    time::{Interval, MissedTickBehavior},
+};
+use utoipa::IntoParams;
+
+use crate::{
+    error::{Kind, Problem},
+    extract::InQuery,
+    limits::{FEED_LOOPS_MAX, HOSTS_EVERY, KEEP_ALIVE},
+    server::App,
+    types::{Hosts, Record},
+};
+
+/// What of the records.
+#[derive(Debug, Deserialize, IntoParams)]
+#[into_params(parameter_in = Query)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct LiveQuery {
+    /// Only these loops, names separated by commas, at most 64; all where not given.
+    loops: Option<String>,
+    /// At most one record per loop in this many ms, besides those with events; all where not given.
+    every_ms: Option<u32>,
+    /// With the controllers' states.
+    #[serde(default)]
+    state: bool,
+}
+
+/// Follows the records. Events: `record` (a record), `hosts` (the hosts, every second, the first at once), `lost` (how many
+/// records this reader was too slow for).
+#[utoipa::path(get, path = "/v1/live", tag = "cell", params(LiveQuery),
+    responses(
+        (status = 200, description = "Server-sent events: `record` with a Record, `hosts` with Hosts, `lost` with {\"records\": n}",
+            body = Record, content_type = "text/event-stream"),
+        (status = "default", description = "What went wrong", body = Problem, content_type = "application/problem+json")))]
+pub(crate) async fn feed(
+    State(app): State<App>,
+    InQuery(query): InQuery<LiveQuery>,
+) -> Result<impl IntoResponse, Problem> {
+    let loops = query.loops.as_deref().map(loop_names).transpose()?;
+    let place = Arc::clone(&app.feeds).try_acquire_owned().map_err(|_| {
+        Problem::new(
+            Kind::Busy,
+            "too many live feeds are open",
+            "close one, or ask another host of the cell",
+        )
+    })?;
+    let mut hosts = tokio::time::interval(HOSTS_EVERY);
+    hosts.set_missed_tick_behavior(MissedTickBehavior::Skip);
+    let feed = Feed {
+        records: app.cell.records(),
+        stop: app.stop.clone(),
+        hosts,
+        filter: Filter {
+            loops,
+            every_ns: u64::from(query.every_ms.unwrap_or(0)) * 1_000_000,
+            sent: HashMap::new(),
+        },
+        with_state: query.state,
+        app,
+        _place: place,
+    };
+    let events = stream::unfold(feed, async |mut feed| {
+        feed.next().await.map(|event| (Ok::<_, Infallible>(event), feed))
+    });
+    // Proxies such as nginx hold back what they do not know to be a feed.
+    let unbuffered = [(HeaderName::from_static("x-accel-buffering"), "no")];
+    Ok((
+        unbuffered,
+        Sse::new(events).keep_alive(KeepAlive::new().interval(KEEP_ALIVE)),
+    ))
+}
+
+/// Names from the query.
+fn loop_names(text: &str) -> Result<HashSet<LoopId>, Problem> {
+    let names: HashSet<LoopId> = text
+        .split(',')
+        .map(str::trim)
+        .filter(|name| !name.is_empty())
+        .map(LoopId::new)
+        .collect::<Result<_, _>>()?;
+    if names.is_empty() || names.len() > FEED_LOOPS_MAX {
+        let detail = format!("loops names {} loops", names.len());
+        return Err(Problem::new(
+            Kind::Invalid,
+            detail,
+            format!("name 1 to {FEED_LOOPS_MAX}, or leave it out for all"),
+        ));
+    }
+    Ok(names)
+}
+
+/// Which records pass.
+struct Filter {
+    loops: Option<HashSet<LoopId>>,
+    every_ns: u64,
+    /// When a record of each loop was last passed on; only kept where records are thinned out.
+    sent: HashMap<LoopId, u64>,
+}
+
+impl Filter {
+    fn passes(&mut self, record: &CoreRecord) -> bool {
+        if self
+            .loops
+            .as_ref()
+            .is_some_and(|loops| !loops.contains(&record.loop_id))
+        {
+            return false;
+        }
+        if self.every_ns == 0 {
+            return true;
+        }
+        let due = self
+            .sent
+            .get(&record.loop_id)
+            .is_none_or(|&at| record.at_ns >= at.saturating_add(self.every_ns));
+        if due {
+            self.sent.insert(record.loop_id.clone(), record.at_ns);
+        }
+        // What people should hear of is never thinned out.
+        due || !record.events.is_empty() || !record.alarms.is_empty()
+    }
+}
+
+/// One reader.
+struct Feed {
+    app: App,
+    records: broadcast::Receiver<Arc<CoreRecord>>,
+    hosts: Interval,
+    stop: watch::Receiver<bool>,
+    filter: Filter,
+    with_state: bool,
+    _place: OwnedSemaphorePermit,
+}
+
+impl Feed {
+    /// The next event; none when the host stops.
+    async fn next(&mut self) -> Option<Event> {
+        loop {
+            let event = tokio::select! {
+                biased;
+                _ = self.stop.wait_for(|stop| *stop) => return None,
+                _ = self.hosts.tick() => {
+                    let hosts = Hosts { hosts: self.app.cell.hosts().into_iter().map(Into::into).collect() };
+                    Event::default().event("hosts").json_data(hosts)
+                }
+                next = self.records.recv() => match next {
+                    Ok(record) if self.filter.passes(&record) => {
+                        let ports = self.app.ports(&record.digest);
+                        Event::default().event("record").json_data(Record::new(&record, &ports, self.with_state))
+                    }
+                    Ok(_) => continue,
+                    Err(RecvError::Lagged(lost)) => {
+                        Event::default().event("lost").json_data(serde_json::json!({ "records": lost }))
+                    }
+                    Err(RecvError::Closed) => return None,
+                },
+            };
+            match event {
+                Ok(event) => return Some(event),
+                // Plain data always serialises; if it ever does not, the feed goes on without it.
+                Err(error) => tracing::warn!(%error, "an event of the live feed could not be written"),
+            }
+        }
+    }
+}

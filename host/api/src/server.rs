@@ -1,0 +1,267 @@
+//! Composes the routes and serves them until the host stops.
+//!
+//! ```text
+//! serving ── shutdown ──► stopping: no new connections, feeds end, requests finish ── at most STOP_TIME_MAX ──► done
+//! ```
+//! Never: knows what a route does.
+
+use std::{
+    future::Future,
+    panic::AssertUnwindSafe,
+    sync::{Arc, Mutex, PoisonError},
+    time::Duration,
+};
+
+use axum::{
+    Router,
+    extract::{MatchedPath, Request, State},
+    http::{HeaderValue, Method, header},
+    middleware::{self, Next},
+    response::{IntoResponse as _, Response},
+};
+use bumpless_core::Digest;
+use bumpless_deploy::Deploy;
+use futures_util::FutureExt as _;
+use tokio::{
+    net::TcpListener,
+    sync::{Semaphore, watch},
+};
+
+use crate::{
+    cell::{Answer, Cell},
+    error::{Error, Kind, Problem},
+    limits::{
+        CALL_TIME_MAX, CHANGE_TIME_MAX, FEEDS_MAX, PORT_TABLES_MAX, REQUEST_TIME_MAX, REQUESTS_MAX, STOP_TIME_MAX,
+        UPLOAD_TIME_MAX, UPLOADS_MAX,
+    },
+    metrics::Metrics,
+    routes,
+    types::{PortTable, PortTables},
+};
+
+/// What the composition root decides about the API.
+#[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct Options {
+    /// Requests worked on at once.
+    pub requests_max: usize,
+    /// Live feeds open at once.
+    pub feeds_max: usize,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self {
+            requests_max: REQUESTS_MAX,
+            feeds_max: FEEDS_MAX,
+        }
+    }
+}
+
+/// What every route may use.
+#[derive(Clone)]
+pub(crate) struct App {
+    pub(crate) cell: Arc<dyn Cell>,
+    pub(crate) metrics: Arc<Metrics>,
+    /// Places for live feeds.
+    pub(crate) feeds: Arc<Semaphore>,
+    /// Places for the bytes of uploads.
+    pub(crate) uploads: Arc<Semaphore>,
+    /// Turns true when the host stops.
+    pub(crate) stop: watch::Receiver<bool>,
+    requests: Arc<Semaphore>,
+    ports: Arc<Mutex<PortTables>>,
+}
+
+impl App {
+    pub(crate) fn new(cell: Arc<dyn Cell>, options: &Options, stop: watch::Receiver<bool>) -> Self {
+        Self {
+            metrics: Arc::new(Metrics::new(Arc::clone(&cell))),
+            feeds: Arc::new(Semaphore::new(options.feeds_max)),
+            uploads: Arc::new(Semaphore::new(UPLOADS_MAX)),
+            requests: Arc::new(Semaphore::new(options.requests_max)),
+            ports: Arc::default(),
+            stop,
+            cell,
+        }
+    }
+
+    /// Names of a component's ports; numbers stand in where the library does not know it.
+    pub(crate) fn ports(&self, digest: &Digest) -> Arc<PortTable> {
+        // A poisoned table is still a table: each insert is whole.
+        let mut tables = self.ports.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(table) = tables.get(digest) {
+            return Arc::clone(table);
+        }
+        let Ok(info) = self.cell.resolve(&digest.to_string()) else {
+            return Arc::default();
+        };
+        if tables.len() >= PORT_TABLES_MAX {
+            tables.clear();
+        }
+        let table = Arc::new(PortTable::new(&info.descriptor));
+        tables.insert(*digest, Arc::clone(&table));
+        table
+    }
+}
+
+/// Finishes what was begun, even when its asker leaves: a change stops only at an end that the cell knows.
+pub(crate) async fn finish<T: Send + 'static>(answer: Answer<T>) -> Result<T, Problem> {
+    match tokio::spawn(answer).await {
+        Ok(result) => result.map_err(Into::into),
+        Err(error) => {
+            tracing::error!(%error, "a change ended with a panic");
+            Err(Problem::new(
+                Kind::Internal,
+                "the change failed inside the host",
+                "its log says more; report this",
+            ))
+        }
+    }
+}
+
+/// Serves the API on `listener` until `shutdown` ends; then feeds end, and requests get [`STOP_TIME_MAX`] to finish.
+///
+/// # Errors
+/// The listener failed for good.
+pub async fn serve(
+    listener: TcpListener,
+    deploy: Deploy,
+    options: Options,
+    shutdown: impl Future<Output = ()> + Send + 'static,
+) -> Result<(), Error> {
+    serve_cell(listener, Arc::new(deploy), &options, shutdown).await
+}
+
+pub(crate) async fn serve_cell(
+    listener: TcpListener,
+    cell: Arc<dyn Cell>,
+    options: &Options,
+    shutdown: impl Future<Output = ()> + Send + 'static,
+) -> Result<(), Error> {
+    let (stopping, mut stop) = watch::channel(false);
+    let app = App::new(Arc::clone(&cell), options, stop.clone());
+    let follower = tokio::spawn(Arc::clone(&app.metrics).follow(cell, stop.clone()));
+    let graceful = async move {
+        shutdown.await;
+        // Nobody listens only when nothing is served any more.
+        let _ = stopping.send(true);
+    };
+    let serving = async {
+        axum::serve(listener, router(app))
+            .with_graceful_shutdown(graceful)
+            .await
+    };
+    let overdue = async {
+        let _ = stop.wait_for(|stop| *stop).await;
+        tokio::time::sleep(STOP_TIME_MAX).await;
+    };
+    let end = tokio::select! {
+        end = serving => end.map_err(Error::Listener),
+        () = overdue => {
+            tracing::warn!("connections of the API were still open {} s after the stop", STOP_TIME_MAX.as_secs());
+            Ok(())
+        }
+    };
+    follower.abort();
+    end
+}
+
+/// All routes behind their limits.
+pub(crate) fn router(app: App) -> Router {
+    let limited = routes::all()
+        .method_not_allowed_fallback(async |method: Method| {
+            Problem::new(
+                Kind::Method,
+                format!("{method} means nothing here"),
+                "the header Allow lists what does",
+            )
+        })
+        .fallback(async |request: Request| {
+            let path: String = request.uri().path().chars().take(200).collect();
+            Problem::new(
+                Kind::NoSuchRoute,
+                format!("{path} is no address of this API"),
+                "GET / lists them",
+            )
+        })
+        .layer(middleware::from_fn_with_state(app.clone(), limit));
+    // Health is asked for most when the host has no place left.
+    limited
+        .merge(routes::health())
+        .layer(middleware::from_fn_with_state(app.clone(), finish_answer))
+        .with_state(app)
+}
+
+/// Longest time of a route.
+fn time_max(method: &Method, path: &str) -> Duration {
+    match (method.as_str(), path) {
+        ("POST", "/v1/components") => UPLOAD_TIME_MAX,
+        ("POST", "/v1/components/{reference}/call") => CALL_TIME_MAX,
+        ("PUT", "/v1/loops/{name}")
+        | ("POST", "/v1/loops/{name}/swap" | "/v1/loops/{name}/set" | "/v1/loops/{name}/rollback") => CHANGE_TIME_MAX,
+        _ => REQUEST_TIME_MAX,
+    }
+}
+
+/// One place of so many, and the time limit of the route.
+async fn limit(State(app): State<App>, request: Request, next: Next) -> Response {
+    let Ok(_place) = app.requests.try_acquire() else {
+        return Problem::new(
+            Kind::Busy,
+            "too many requests are being worked on",
+            "try again in a second",
+        )
+        .into_response();
+    };
+    let path = request
+        .extensions()
+        .get::<MatchedPath>()
+        .map_or("", MatchedPath::as_str);
+    let time = time_max(request.method(), path);
+    match tokio::time::timeout(time, next.run(request)).await {
+        Ok(response) => response,
+        Err(_) => Problem::new(
+            Kind::Timeout,
+            format!("the answer took longer than {} s", time.as_secs()),
+            "what was asked may still happen: look before asking again, and use an Idempotency-Key for commands",
+        )
+        .into_response(),
+    }
+}
+
+/// Turns a panic into an answer, counts, and adds the headers that every answer has.
+async fn finish_answer(State(app): State<App>, request: Request, next: Next) -> Response {
+    let method = request.method().clone();
+    let mut response = AssertUnwindSafe(next.run(request))
+        .catch_unwind()
+        .await
+        .unwrap_or_else(|_| {
+            tracing::error!(%method, "a request ended with a panic");
+            Problem::new(
+                Kind::Internal,
+                "the request failed inside the host",
+                "its log says more; report this",
+            )
+            .into_response()
+        });
+    app.metrics.answered(known(&method), response.status().as_u16());
+    let headers = response.headers_mut();
+    headers.insert(header::X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff"));
+    headers
+        .entry(header::CACHE_CONTROL)
+        .or_insert(HeaderValue::from_static("no-store"));
+    response
+}
+
+/// The method as a label: a closed list, for a client may invent methods.
+fn known(method: &Method) -> &'static str {
+    match method.as_str() {
+        "GET" => "GET",
+        "HEAD" => "HEAD",
+        "POST" => "POST",
+        "PUT" => "PUT",
+        "DELETE" => "DELETE",
+        _ => "other",
+    }
+}

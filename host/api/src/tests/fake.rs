@@ -1,0 +1,352 @@
+//! A cell of one host `h` with one loop `l`, in memory. It notes what it is asked.
+
+use std::sync::{
+    Arc, Mutex,
+    atomic::{AtomicBool, AtomicUsize, Ordering},
+};
+
+use bumpless_core::{
+    Applied, CommandBody, CommandId, ComponentInfo, Descriptor, Digest, Direction, Event, HostId, LoopId, LoopSpec,
+    Mode, Outcome, PointId, Policy, PortKind, PortSpec, Reading, Record, Strategy, desk::Tally,
+};
+use bumpless_deploy::{
+    ApplyEnd, Call, CallEnd, Change, CommandEnd, ComponentView, Counters, Error, HostView, LoopDraft, LoopView,
+    PointView,
+};
+use serde_json::{Value, json};
+use tokio::sync::{Notify, broadcast};
+
+use crate::cell::{Answer, Cell};
+
+/// Records that a lagging reader still gets.
+pub(crate) const FEED_CAPACITY: usize = 8;
+
+pub(crate) struct Fake {
+    /// Questions that would change something.
+    pub(crate) asked: AtomicUsize,
+    pub(crate) refusal: Mutex<Option<Error>>,
+    pub(crate) outcome: Mutex<Outcome>,
+    pub(crate) commands: Mutex<Vec<(Option<CommandId>, CommandBody)>>,
+    pub(crate) drafts: Mutex<Vec<LoopDraft>>,
+    pub(crate) uploads: Mutex<Vec<(Vec<u8>, String, String)>>,
+    pub(crate) loops: Mutex<Vec<LoopView>>,
+    /// Changes and calls wait for `go_on` while this is set.
+    pub(crate) slow: AtomicBool,
+    pub(crate) go_on: Arc<Notify>,
+    /// Changes that came to their end.
+    pub(crate) finished: Arc<AtomicUsize>,
+    pub(crate) panics: AtomicBool,
+    records: broadcast::Sender<Arc<Record>>,
+}
+
+impl Fake {
+    pub(crate) fn new() -> Self {
+        Self {
+            asked: AtomicUsize::new(0),
+            refusal: Mutex::default(),
+            outcome: Mutex::new(Outcome::Done),
+            commands: Mutex::default(),
+            drafts: Mutex::default(),
+            uploads: Mutex::default(),
+            loops: Mutex::new(vec![view("l")]),
+            slow: AtomicBool::new(false),
+            go_on: Arc::default(),
+            finished: Arc::default(),
+            panics: AtomicBool::new(false),
+            records: broadcast::channel(FEED_CAPACITY).0,
+        }
+    }
+
+    pub(crate) fn publish(&self, name: &str, seq: u64) {
+        self.records
+            .send(Arc::new(record(name, seq)))
+            .expect("somebody listens");
+    }
+
+    pub(crate) fn readers(&self) -> usize {
+        self.records.receiver_count()
+    }
+
+    /// The answer, or the refusal that is set; late while the cell is slow.
+    fn answer<T: Send + 'static>(&self, value: T) -> Answer<T> {
+        self.asked.fetch_add(1, Ordering::Relaxed);
+        let refusal = self.refusal.lock().unwrap().clone();
+        let wait = self.slow.load(Ordering::Relaxed).then(|| Arc::clone(&self.go_on));
+        let finished = Arc::clone(&self.finished);
+        Box::pin(async move {
+            if let Some(wait) = wait {
+                wait.notified().await;
+            }
+            finished.fetch_add(1, Ordering::Relaxed);
+            refusal.map_or(Ok(value), Err)
+        })
+    }
+}
+
+fn digest() -> Digest {
+    Digest::of(b"pid")
+}
+
+fn loop_id(name: &str) -> LoopId {
+    LoopId::new(name).expect("valid")
+}
+
+fn host() -> HostId {
+    HostId::new("h").expect("valid")
+}
+
+fn port(name: &str, direction: Direction, unit: &str) -> PortSpec {
+    PortSpec {
+        name: name.into(),
+        direction,
+        kind: PortKind::Analog,
+        unit: unit.into(),
+        required: true,
+        text: String::new(),
+    }
+}
+
+fn info() -> ComponentInfo {
+    ComponentInfo {
+        digest: digest(),
+        name: "pid".into(),
+        version: "1.0.0".into(),
+        descriptor: Descriptor {
+            name: "pid".into(),
+            version: "1.0.0".into(),
+            text: String::new(),
+            ports: vec![port("pv", Direction::Input, "bar"), port("out", Direction::Output, "%")],
+            parameters: Vec::new(),
+            state_layout: 1,
+        },
+        imports: Vec::new(),
+        bytes: 3,
+        uploaded_at_unix_ms: 0,
+        uploaded_by: "api".into(),
+        note: String::new(),
+    }
+}
+
+fn record(name: &str, seq: u64) -> Record {
+    Record {
+        loop_id: loop_id(name),
+        term: 1,
+        seq,
+        after: (1, seq.saturating_sub(1)),
+        revision: 1,
+        digest: digest(),
+        owner: host(),
+        stepped_by: host(),
+        at_ns: 5_000_000,
+        dt_ns: 100_000_000,
+        mode: Mode::Automatic,
+        setpoint: 1.5,
+        manual: vec![f64::NAN],
+        readings: vec![Reading::good(1.25, 4_000_000), Reading::good(30.0, 0)],
+        wanted: vec![30.0],
+        outputs: vec![30.0],
+        state: Arc::from([1, 2, 3]),
+        faults_in_row: 0,
+        probation: None,
+        applied: Vec::new(),
+        events: vec![Event::Limited(1)],
+        alarms: Vec::new(),
+        messages: Vec::new(),
+        log: Vec::new(),
+        step_ns: 1_000,
+        cycle_ns: 2_000,
+        committed_after_ns: 3_000,
+    }
+}
+
+pub(crate) fn view(name: &str) -> LoopView {
+    let point = |name: &str| PointId::new(name).expect("valid");
+    LoopView {
+        id: loop_id(name),
+        home: host(),
+        spec: LoopSpec {
+            id: loop_id(name),
+            revision: 1,
+            digest: digest(),
+            period_ns: 100_000_000,
+            ports: [
+                ("pv".to_owned(), point("plant.pit129")),
+                ("out".to_owned(), point("plant.p1")),
+            ]
+            .into(),
+            parameters: [("kp".to_owned(), 2.0)].into(),
+            setpoint: 1.0,
+            setpoint_range: (0.0, 2.5),
+            mode: Mode::Automatic,
+            strategy: Strategy::RoundRobin,
+            replicas: 3,
+            limits: Default::default(),
+            listens: Vec::new(),
+            policy: Policy::default(),
+        },
+        pending: None,
+        past: Vec::new(),
+        component: "pid@1.0.0".into(),
+        last: Some(Arc::new(record(name, 9))),
+        last_age_ms: Some(3),
+        members: vec![host()],
+        tally: Some(Tally {
+            taken: 5,
+            ..Tally::default()
+        }),
+        failures: Vec::new(),
+    }
+}
+
+pub(crate) fn draft(name: &str) -> Value {
+    json!({
+        "name": name, "component": "pid", "period_ms": 100, "ports": {"pv": "plant.pit129", "out": "plant.p1"},
+        "parameters": {"kp": 2.0}, "setpoint": 1.0, "setpoint_range": [0.0, 2.5], "strategy": "p2c",
+        "limits": {"out": {"low": 0, "high": 10, "safe": 0, "rate_per_s": 5}}, "policy": {"on_fault": "safe-value"},
+    })
+}
+
+pub(crate) fn call(dt_ms: f64) -> Value {
+    json!({"inputs": {"pv": 1.0}, "setpoint": 1.5, "dt_ms": dt_ms, "state": "AQID"})
+}
+
+fn apply_end() -> ApplyEnd {
+    ApplyEnd {
+        id: loop_id("l"),
+        revision: 1,
+        created: true,
+        unchanged: false,
+        hand_over: None,
+        dropped_parameters: Vec::new(),
+        dropped_ports: Vec::new(),
+    }
+}
+
+impl Cell for Fake {
+    fn upload(&self, bytes: Vec<u8>, by: String, note: String) -> Answer<ComponentInfo> {
+        self.uploads.lock().unwrap().push((bytes, by, note));
+        self.answer(info())
+    }
+
+    fn components(&self) -> Vec<ComponentView> {
+        vec![ComponentView {
+            info: info(),
+            used_by: vec![loop_id("l")],
+            ready_on: vec![host()],
+        }]
+    }
+
+    fn resolve(&self, reference: &str) -> Result<ComponentInfo, Error> {
+        if reference == "none" {
+            Err(Error::not_found("no component none", "upload it"))
+        } else {
+            Ok(info())
+        }
+    }
+
+    fn component_bytes(&self, _: Digest) -> Answer<Vec<u8>> {
+        self.answer(vec![1, 2, 3])
+    }
+
+    fn remove_component(&self, _: String) -> Answer<()> {
+        self.answer(())
+    }
+
+    fn apply(&self, draft: LoopDraft) -> Answer<ApplyEnd> {
+        self.drafts.lock().unwrap().push(draft);
+        self.answer(apply_end())
+    }
+
+    fn loops(&self) -> Vec<LoopView> {
+        self.loops.lock().unwrap().clone()
+    }
+
+    fn loop_view(&self, id: &LoopId) -> Result<LoopView, Error> {
+        let found = self.loops.lock().unwrap().iter().find(|view| view.id == *id).cloned();
+        found.ok_or_else(|| Error::not_found(format!("no loop {id}"), ""))
+    }
+
+    fn command(&self, _: LoopId, command_id: Option<CommandId>, body: CommandBody) -> Answer<CommandEnd> {
+        self.commands.lock().unwrap().push((command_id, body));
+        let applied = Applied {
+            id: command_id.unwrap_or(CommandId(1)),
+            outcome: self.outcome.lock().unwrap().clone(),
+        };
+        self.answer(CommandEnd {
+            applied,
+            position: (1, 9),
+            mode: Mode::Automatic,
+            setpoint: 1.5,
+        })
+    }
+
+    fn swap(&self, _: LoopId, _: String) -> Answer<ApplyEnd> {
+        self.answer(apply_end())
+    }
+
+    fn set(&self, _: LoopId, _: Change) -> Answer<ApplyEnd> {
+        self.answer(apply_end())
+    }
+
+    fn rollback(&self, _: LoopId, _: Option<u64>) -> Answer<ApplyEnd> {
+        self.answer(apply_end())
+    }
+
+    fn delete(&self, _: LoopId) -> Answer<()> {
+        self.answer(())
+    }
+
+    fn move_owner(&self, _: LoopId, _: HostId) -> Answer<()> {
+        self.answer(())
+    }
+
+    fn hosts(&self) -> Vec<HostView> {
+        assert!(!self.panics.load(Ordering::Relaxed), "the test wants a panic");
+        vec![HostView {
+            id: host(),
+            here: true,
+            alive: true,
+            io: true,
+            control: true,
+            draining: false,
+            api: None,
+            cpu: 0.25,
+            cpu_process: 0.1,
+            memory_bytes: 1_000_000,
+            latency_ns: Some(200_000),
+            loops_owned: 1,
+            loops_held: 1,
+            version: "0.1.0".into(),
+        }]
+    }
+
+    fn here(&self) -> HostId {
+        host()
+    }
+
+    fn points(&self) -> Answer<Vec<PointView>> {
+        self.answer(Vec::new())
+    }
+
+    fn call(&self, _: Call) -> Answer<CallEnd> {
+        self.answer(CallEnd {
+            host: host(),
+            state: vec![4, 5],
+            outputs: [("out".to_owned(), 7.5)].into(),
+            step_ns: 900,
+            total_ns: 250_000,
+        })
+    }
+
+    fn records(&self) -> broadcast::Receiver<Arc<Record>> {
+        self.records.subscribe()
+    }
+
+    fn counters(&self) -> Counters {
+        Counters {
+            hosts_alive: 1,
+            cycles_taken: 7,
+            ..Counters::default()
+        }
+    }
+}

@@ -1,0 +1,57 @@
+//! What travels over HTTP: plain JSON, apart from the model, with units in the names.
+//!
+//! Requests refuse keys that they do not know, so that a misspelt parameter is an error and not a default. Answers may get
+//! more keys in later versions; a reader ignores what it does not know. Digests are 64 hexadecimal digits, state and
+//! message bytes are base64, a number that is not finite is null.
+//! Never: decides or checks more than its own shape; the cell does.
+
+mod call;
+mod component;
+mod hosts;
+mod loops;
+mod record;
+mod words;
+
+pub use call::{CallAnswer, CallRequest};
+pub use component::{Component, Components, Parameter, Port};
+pub use hosts::{Host, Hosts, Point, Points};
+pub use loops::{
+    Apply, Command, Failure, HandOver, Loop, LoopDraft, Loops, ModeRequest, MoveRequest, OutputLimit, OutputRequest,
+    Policy, RollbackRequest, SetRequest, SetpointRequest, SwapRequest, Tally,
+};
+pub use record::{Alarm, Applied, Event, LogLine, Message, Reading, Record};
+pub use words::{Direction, LogLevel, Mode, OnFault, PortKind, Priority, Quality, Strategy};
+
+pub(crate) use loops::Depth;
+pub(crate) use record::{PortTable, PortTables};
+
+use base64::{Engine as _, engine::general_purpose::STANDARD};
+
+/// Bytes as base64 (RFC 4648 §4, padded).
+#[must_use]
+pub fn to_base64(bytes: &[u8]) -> String {
+    STANDARD.encode(bytes)
+}
+
+/// Bytes from base64, or why the text is none.
+///
+/// # Errors
+/// In words, without the text.
+pub fn from_base64(text: &str) -> Result<Vec<u8>, String> {
+    STANDARD.decode(text).map_err(|error| error.to_string())
+}
+
+/// A number for JSON: null where it is not finite.
+fn finite(value: f64) -> Option<f64> {
+    value.is_finite().then_some(value)
+}
+
+/// Nanoseconds as milliseconds.
+fn ms(ns: u64) -> f64 {
+    ns as f64 / 1e6
+}
+
+/// Nanoseconds as microseconds.
+fn us(ns: u64) -> f64 {
+    ns as f64 / 1e3
+}

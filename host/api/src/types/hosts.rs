@@ -1,0 +1,123 @@
+//! Hosts and points.
+
+use bumpless_deploy::{HostView, PointView};
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+
+use super::{Quality, finite, ms};
+
+/// The hosts of the cell, by name.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct Hosts {
+    /// The hosts.
+    pub hosts: Vec<Host>,
+}
+
+/// A host as the one that answers sees it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct Host {
+    /// Its name.
+    pub name: String,
+    /// Is it the one that answers?
+    pub here: bool,
+    /// Is it alive?
+    pub alive: bool,
+    /// Does it serve I/O?
+    pub io: bool,
+    /// Does it run controllers?
+    pub control: bool,
+    /// Is it being emptied?
+    pub draining: bool,
+    /// Address of its API.
+    pub api: Option<String>,
+    /// Load of the cores that it may use, in %.
+    pub cpu_percent: f64,
+    /// Its own use, in cores.
+    pub cpu_process_cores: f64,
+    /// Resident bytes.
+    pub memory_bytes: u64,
+    /// Smoothed latency of a step there, as the answering host measures it, in ms.
+    pub latency_ms: Option<f64>,
+    /// Loops that it owns now.
+    pub loops_owned: u32,
+    /// Loops that it holds: owned, or ready to take over.
+    pub loops_held: u32,
+    /// Version of its program.
+    pub version: String,
+}
+
+impl From<HostView> for Host {
+    fn from(view: HostView) -> Self {
+        Self {
+            name: view.id.to_string(),
+            here: view.here,
+            alive: view.alive,
+            io: view.io,
+            control: view.control,
+            draining: view.draining,
+            api: view.api,
+            cpu_percent: finite(f64::from(view.cpu) * 100.0).unwrap_or_default(),
+            cpu_process_cores: finite(f64::from(view.cpu_process)).unwrap_or_default(),
+            memory_bytes: view.memory_bytes,
+            latency_ms: view.latency_ns.map(ms),
+            loops_owned: view.loops_owned,
+            loops_held: view.loops_held,
+            version: view.version,
+        }
+    }
+}
+
+/// The points of all hosts, by name.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct Points {
+    /// The points.
+    pub points: Vec<Point>,
+}
+
+/// A point as its I/O host sees it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct Point {
+    /// Its name.
+    pub name: String,
+    /// Its I/O host.
+    pub host: String,
+    /// Its bus.
+    pub bus: String,
+    /// Unit.
+    pub unit: String,
+    /// Least and greatest value.
+    pub range: [f64; 2],
+    /// May it be written?
+    pub writable: bool,
+    /// Value now, or the last good one.
+    pub value: Option<f64>,
+    /// How far it may be trusted.
+    pub quality: Quality,
+    /// Why there is no value; empty where there is one.
+    pub reason: String,
+    /// Age of the value, in ms.
+    pub age_ms: u64,
+    /// The loop that writes it.
+    pub written_by: Option<String>,
+    /// One line for people.
+    pub text: String,
+}
+
+impl From<PointView> for Point {
+    fn from(view: PointView) -> Self {
+        Self {
+            name: view.id.to_string(),
+            host: view.host.to_string(),
+            bus: view.bus,
+            unit: view.unit,
+            range: [view.range.0, view.range.1],
+            writable: view.writable,
+            value: view.value.and_then(finite),
+            quality: view.quality.into(),
+            reason: view.reason,
+            age_ms: view.age_ms,
+            written_by: view.written_by.map(Into::into),
+            text: view.text,
+        }
+    }
+}

@@ -1,0 +1,159 @@
+//! The closed lists of words, each with its way from and to the model.
+
+use bumpless_core as model;
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+
+/// A closed list with the same words in the model.
+macro_rules! words {
+    ($(#[$doc:meta])* $name:ident = $model:ty { $($(#[$word_doc:meta])* $word:ident,)* }) => {
+        $(#[$doc])*
+        #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
+        #[serde(rename_all = "kebab-case")]
+        pub enum $name {
+            $($(#[$word_doc])* $word,)*
+        }
+
+        impl From<$model> for $name {
+            fn from(word: $model) -> Self {
+                match word {
+                    $(<$model>::$word => Self::$word,)*
+                }
+            }
+        }
+
+        impl From<$name> for $model {
+            fn from(word: $name) -> Self {
+                match word {
+                    $($name::$word => Self::$word,)*
+                }
+            }
+        }
+    };
+}
+
+words! {
+    /// Who decides the output.
+    Mode = model::Mode {
+        /// The operator.
+        Manual,
+        /// The controller.
+        Automatic,
+    }
+}
+
+words! {
+    /// How the replica that steps is chosen.
+    Strategy = model::Strategy {
+        /// Each in turn, by cycle number.
+        RoundRobin,
+        /// Any, evenly.
+        Random,
+        /// The least loaded processor.
+        Cpu,
+        /// The shortest smoothed latency.
+        Latency,
+        /// Two at random, the better by latency times load.
+        P2c,
+        /// The owner itself.
+        Local,
+        /// The same one for a loop, by rendezvous hash.
+        Shard,
+    }
+}
+
+words! {
+    /// What a loop does when it has no good step.
+    OnFault = model::OnFault {
+        /// Keep the output.
+        Hold,
+        /// Move the output to its safe value, at its rate limit.
+        SafeValue,
+        /// Keep the output and put the loop in manual.
+        Manual,
+    }
+}
+
+words! {
+    /// How far a value may be trusted.
+    Quality = model::Quality {
+        /// Not usable for control.
+        Bad,
+        /// Usable with care: held, simulated, near a range limit.
+        Uncertain,
+        /// Usable.
+        Good,
+    }
+}
+
+words! {
+    /// Which way a port's values flow.
+    Direction = model::Direction {
+        /// From the process to the controller.
+        Input,
+        /// From the controller to the process.
+        Output,
+    }
+}
+
+words! {
+    /// What kind of number a port carries.
+    PortKind = model::PortKind {
+        /// A quantity in the port's unit.
+        Analog,
+        /// 0 is off, anything else is on.
+        Digital,
+    }
+}
+
+words! {
+    /// How urgent an alarm is (ISA-18.2).
+    Priority = model::Priority {
+        /// Act soon.
+        Low,
+        /// Act promptly.
+        Medium,
+        /// Act at once.
+        High,
+    }
+}
+
+words! {
+    /// How much a log line matters.
+    LogLevel = model::LogLevel {
+        /// For the author.
+        Debug,
+        /// For the record.
+        Info,
+        /// Something is odd.
+        Warning,
+    }
+}
+
+impl Mode {
+    /// The word as JSON has it.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        model::Mode::from(self).name()
+    }
+}
+
+impl Strategy {
+    /// The word as JSON has it.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        model::Strategy::from(self).name()
+    }
+}
+
+impl Quality {
+    /// The word as JSON has it.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Bad => "bad",
+            Self::Uncertain => "uncertain",
+            Self::Good => "good",
+        }
+    }
+}
