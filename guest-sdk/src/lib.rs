@@ -120,10 +120,10 @@ macro_rules! export_unchecked {
         #[cfg(target_arch = "wasm32")]
         #[allow(
             unsafe_code,
-    reason = "the component model's exports are C functions; the generated code is their only user"
+            reason = "the component model's exports are C functions; the generated code is their only user"
         )]
         const _: () = {
-            $crate::bindings::export_component!($guest with_types_in $crate::bindings);
+    $crate::bindings::export_component!($guest with_types_in $crate::bindings);
         };
     };
 }

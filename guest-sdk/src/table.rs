@@ -1,6 +1,20 @@
 //! Tables of ports and parameters as constants, and the handles that are looked up in them while compiling.
 //!
 //! Owns the checks that a description passes before it is built into a component. Never: looks up a name at run time.
+//!
+//! ```compile_fail
+//! use bumpless_sdk::{Input, PortSpec};
+//! const PORTS: &[PortSpec] = &[PortSpec::analog_input("pv", "", "")];
+//! const PV: Input = Input::of(PORTS, "vp"); // no port of that name
+//! # let _ = PV;
+//! ```
+//! ```compile_fail
+//! use bumpless_sdk::{Description, PortSpec};
+//! const TWICE: &[PortSpec] = &[PortSpec::analog_output("out", "", ""), PortSpec::analog_output("out", "", "")];
+//! const D: Description =
+//!     Description { name: "x", version: "1.0.0", text: "", ports: TWICE, parameters: &[], state_layout: 1 };
+//! const _: () = D.check(); // two ports share a name
+//! ```
 
 /// Which way a port's values flow.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
