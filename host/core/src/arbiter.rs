@@ -26,7 +26,12 @@ impl Arbiter {
     /// `term_floor` and than the last record's term.
     #[must_use]
     pub fn new(last: (u64, u64), term_floor: u64) -> Self {
-        Self { term: last.0.max(term_floor), owner: None, last, outstanding: None }
+        Self {
+            term: last.0.max(term_floor),
+            owner: None,
+            last,
+            outstanding: None,
+        }
     }
 
     /// Gives the ownership to `host` under a new term. Whatever the owner before still sends is refused from now on.
@@ -118,7 +123,12 @@ mod tests {
         Appoint(u8),
         Dismiss,
         Open,
-        Commit { owner: u8, term_back: u64, seq_back: u64, right_base: bool },
+        Commit {
+            owner: u8,
+            term_back: u64,
+            seq_back: u64,
+            right_base: bool,
+        },
     }
 
     fn moves() -> impl Strategy<Value = Vec<Move>> {
@@ -128,7 +138,12 @@ mod tests {
                 Just(Move::Dismiss),
                 Just(Move::Open),
                 (0u8..3, 0u64..3, 0u64..3, any::<bool>()).prop_map(|(owner, term_back, seq_back, right_base)| {
-                    Move::Commit { owner, term_back, seq_back, right_base }
+                    Move::Commit {
+                        owner,
+                        term_back,
+                        seq_back,
+                        right_base,
+                    }
                 }),
             ],
             1..200,

@@ -118,7 +118,9 @@ pub enum DescriptorError {
     #[error("no output port is described; a controller needs at least one")]
     NoOutput,
     /// A range that holds no value, or a default outside it.
-    #[error("parameter {name:?}: {minimum} <= default {default} <= {maximum} does not hold, or one of them is not finite")]
+    #[error(
+        "parameter {name:?}: {minimum} <= default {default} <= {maximum} does not hold, or one of them is not finite"
+    )]
     Range {
         /// The parameter.
         name: String,
@@ -158,8 +160,17 @@ pub enum DescriptorError {
 /// 1 to 32 lower-case letters, digits and dashes.
 fn short_name(what: &'static str, name: &str) -> Result<(), DescriptorError> {
     let ok = (1..=32).contains(&name.len())
-        && name.bytes().all(|b| b.is_ascii_lowercase() || b.is_ascii_digit() || b == b'-');
-    if ok { Ok(()) } else { Err(DescriptorError::Name { what, name: name.chars().take(64).collect() }) }
+        && name
+            .bytes()
+            .all(|b| b.is_ascii_lowercase() || b.is_ascii_digit() || b == b'-');
+    if ok {
+        Ok(())
+    } else {
+        Err(DescriptorError::Name {
+            what,
+            name: name.chars().take(64).collect(),
+        })
+    }
 }
 
 fn unique<'a>(what: &'static str, names: impl Iterator<Item = &'a str>) -> Result<(), DescriptorError> {
@@ -167,7 +178,10 @@ fn unique<'a>(what: &'static str, names: impl Iterator<Item = &'a str>) -> Resul
     for name in names {
         short_name(what, name)?;
         if !seen.insert(name) {
-            return Err(DescriptorError::Twice { what, name: name.to_owned() });
+            return Err(DescriptorError::Twice {
+                what,
+                name: name.to_owned(),
+            });
         }
     }
     Ok(())
@@ -183,7 +197,11 @@ impl Descriptor {
             return Err(DescriptorError::Version(self.version.chars().take(64).collect()));
         }
         let too_many = |what, count, max| {
-            if count > max { Err(DescriptorError::TooMany { what, count, max }) } else { Ok(()) }
+            if count > max {
+                Err(DescriptorError::TooMany { what, count, max })
+            } else {
+                Ok(())
+            }
         };
         too_many("port", self.ports.len(), PORTS_MAX)?;
         too_many("parameter", self.parameters.len(), PARAMETERS_MAX)?;
@@ -191,8 +209,16 @@ impl Descriptor {
         unique("parameter", self.parameters.iter().map(|p| p.name.as_str()))?;
         let texts = std::iter::once((&self.name, &self.text))
             .chain(self.ports.iter().flat_map(|p| [(&p.name, &p.text), (&p.name, &p.unit)]))
-            .chain(self.parameters.iter().flat_map(|p| [(&p.name, &p.text), (&p.name, &p.unit)]))
-            .chain(self.parameters.iter().flat_map(|p| p.choices.iter().map(move |c| (&p.name, c))));
+            .chain(
+                self.parameters
+                    .iter()
+                    .flat_map(|p| [(&p.name, &p.text), (&p.name, &p.unit)]),
+            )
+            .chain(
+                self.parameters
+                    .iter()
+                    .flat_map(|p| p.choices.iter().map(move |c| (&p.name, c))),
+            );
         for (owner, text) in texts {
             if text.chars().count() > TEXT_CHARS_MAX {
                 return Err(DescriptorError::TextTooLong(owner.clone()));
@@ -218,7 +244,10 @@ impl Descriptor {
 
     /// The output ports with their numbers, in order.
     pub fn outputs(&self) -> impl Iterator<Item = (usize, &PortSpec)> {
-        self.ports.iter().enumerate().filter(|(_, p)| p.direction == Direction::Output)
+        self.ports
+            .iter()
+            .enumerate()
+            .filter(|(_, p)| p.direction == Direction::Output)
     }
 
     /// The number of a port.
@@ -238,7 +267,12 @@ impl Descriptor {
                 return Err(DescriptorError::UnknownParameter {
                     component: self.name.clone(),
                     name: name.chars().take(64).collect(),
-                    known: self.parameters.iter().map(|p| p.name.as_str()).collect::<Vec<_>>().join(", "),
+                    known: self
+                        .parameters
+                        .iter()
+                        .map(|p| p.name.as_str())
+                        .collect::<Vec<_>>()
+                        .join(", "),
                 });
             };
             let p = &self.parameters[index];

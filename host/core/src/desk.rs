@@ -110,7 +110,11 @@ impl Desk {
     #[must_use]
     pub fn new(home: HostId, spec: Arc<LoopSpec>, last: Option<Arc<Record>>, now_ns: u64, phase_ns: u64) -> Self {
         let position = last.as_ref().map_or((0, 0), |r| r.position());
-        let floor = if last.is_some() { position.0 + TERMS_SKIPPED_AT_RESTART } else { 0 };
+        let floor = if last.is_some() {
+            position.0 + TERMS_SKIPPED_AT_RESTART
+        } else {
+            0
+        };
         Self {
             home,
             arbiter: Arbiter::new(position, floor),
@@ -167,7 +171,9 @@ impl Desk {
     #[must_use]
     pub fn due_at_ns(&self) -> u64 {
         let deadline = self.tick.next_at_ns();
-        self.waiting.as_ref().map_or(deadline, |w| w.overdue_at_ns.min(deadline))
+        self.waiting
+            .as_ref()
+            .map_or(deadline, |w| w.overdue_at_ns.min(deadline))
     }
 
     /// Is a deadline due, or only a silence?
@@ -197,8 +203,10 @@ impl Desk {
 
     /// Takes a command in. Asking twice with one id does it once.
     pub fn command(&mut self, command: Command) -> Queued {
-        if let Some(applied) =
-            self.last.as_ref().and_then(|r| r.applied.iter().find(|a| a.id == command.id).cloned())
+        if let Some(applied) = self
+            .last
+            .as_ref()
+            .and_then(|r| r.applied.iter().find(|a| a.id == command.id).cloned())
         {
             return Queued::Ended(applied);
         }
@@ -215,7 +223,10 @@ impl Desk {
     /// Takes a command back that no record holds yet, for example because its sender stopped waiting. False where it
     /// may have been taken already: it rides in the sample that is out.
     pub fn withdraw(&mut self, id: crate::record::CommandId) -> bool {
-        let riding = self.waiting.as_ref().is_some_and(|w| w.sample.commands.iter().any(|c| c.id == id));
+        let riding = self
+            .waiting
+            .as_ref()
+            .is_some_and(|w| w.sample.commands.iter().any(|c| c.id == id));
         if riding {
             return false;
         }
@@ -304,8 +315,12 @@ impl Desk {
             last: self.arbiter.last(),
             resume: if resume { self.last.clone() } else { None },
         };
-        self.waiting =
-            Some(Waiting { sample: sample.clone(), overdue_at_ns, deadline_ns, tried: vec![owner] });
+        self.waiting = Some(Waiting {
+            sample: sample.clone(),
+            overdue_at_ns,
+            deadline_ns,
+            tried: vec![owner],
+        });
         Some((fired, Dispatch::Send(Box::new(sample))))
     }
 
@@ -327,7 +342,9 @@ impl Desk {
     /// The owner asks for the last record, or declines. None where the answer is not for the cycle that waits.
     pub fn answered(&mut self, now_ns: u64, answer: &Answer) -> Option<Dispatch> {
         let (term, seq, from) = match answer {
-            Answer::NeedRecord { term, seq, owner, .. } | Answer::Decline { term, seq, owner, .. } => (*term, *seq, owner),
+            Answer::NeedRecord { term, seq, owner, .. } | Answer::Decline { term, seq, owner, .. } => {
+                (*term, *seq, owner)
+            }
             Answer::Commit(_) => return None,
         };
         let waiting = self.waiting.as_mut()?;
@@ -390,7 +407,9 @@ impl Desk {
     }
 
     fn owner_is_suspect(&self, now_ns: u64) -> bool {
-        self.arbiter.owner().is_some_and(|o| self.suspects.iter().any(|s| s.host == *o && s.until_ns > now_ns))
+        self.arbiter
+            .owner()
+            .is_some_and(|o| self.suspects.iter().any(|s| s.host == *o && s.until_ns > now_ns))
     }
 
     fn strike(&mut self, now_ns: u64, host: &HostId) {
@@ -402,7 +421,11 @@ impl Desk {
                 s.strikes
             }
             None => {
-                self.suspects.push(Suspect { host: host.clone(), until_ns: 0, strikes: 1 });
+                self.suspects.push(Suspect {
+                    host: host.clone(),
+                    until_ns: 0,
+                    strikes: 1,
+                });
                 1
             }
         };
@@ -420,7 +443,9 @@ impl Desk {
     }
 
     fn redispatch(&mut self, now_ns: u64) -> Dispatch {
-        let Some(mut waiting) = self.waiting.take() else { return Dispatch::Nobody };
+        let Some(mut waiting) = self.waiting.take() else {
+            return Dispatch::Nobody;
+        };
         let Some(next) = self.next_owner(now_ns, &waiting.tried) else {
             self.arbiter.dismiss();
             self.tally.lost += 1;

@@ -17,8 +17,16 @@ pub struct Guarded {
 #[must_use]
 pub fn approach(target: f64, held: f64, limit: &OutputLimit, dt_ns: u64) -> f64 {
     // A held value outside the limits (the limits were narrowed) is pulled in before the rate counts.
-    let held = if held.is_finite() { held.max(limit.low).min(limit.high) } else { limit.safe };
-    let target = if target.is_finite() { target.max(limit.low).min(limit.high) } else { held };
+    let held = if held.is_finite() {
+        held.max(limit.low).min(limit.high)
+    } else {
+        limit.safe
+    };
+    let target = if target.is_finite() {
+        target.max(limit.low).min(limit.high)
+    } else {
+        held
+    };
     match limit.rate_per_s {
         Some(rate_per_s) => {
             let step = rate_per_s * (dt_ns as f64 * 1e-9);
@@ -86,9 +94,18 @@ mod tests {
     use super::*;
 
     fn limit() -> impl Strategy<Value = OutputLimit> {
-        (-100.0..100.0f64, 0.0..100.0f64, prop::option::of(0.001..1000.0f64), 0.0..1.0f64).prop_map(
-            |(low, span, rate_per_s, part)| OutputLimit { low, high: low + span, rate_per_s, safe: low + span * part },
+        (
+            -100.0..100.0f64,
+            0.0..100.0f64,
+            prop::option::of(0.001..1000.0f64),
+            0.0..1.0f64,
         )
+            .prop_map(|(low, span, rate_per_s, part)| OutputLimit {
+                low,
+                high: low + span,
+                rate_per_s,
+                safe: low + span * part,
+            })
     }
 
     proptest! {
@@ -117,7 +134,12 @@ mod tests {
 
     #[test]
     fn nan_holds_and_limits_are_flagged() {
-        let l = OutputLimit { low: 0.0, high: 10.0, rate_per_s: None, safe: 0.0 };
+        let l = OutputLimit {
+            low: 0.0,
+            high: 10.0,
+            rate_per_s: None,
+            safe: 0.0,
+        };
         let g = guard(Mode::Automatic, &[f64::NAN], &[3.0], &[7.0], &[l], 1);
         assert_eq!((g.outputs[0], g.limited), (7.0, 1));
         let g = guard(Mode::Automatic, &[11.0], &[3.0], &[7.0], &[l], 1);

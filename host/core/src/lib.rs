@@ -10,27 +10,27 @@
 
 pub mod limits;
 
-pub mod name;
-pub mod digest;
-pub mod reading;
-pub mod descriptor;
 pub mod component;
+pub mod descriptor;
+pub mod digest;
+pub mod frame;
+pub mod intent;
+pub mod name;
+pub mod protocol;
+pub mod reading;
+pub mod record;
 pub mod spec;
 pub mod wiring;
-pub mod intent;
-pub mod frame;
-pub mod record;
-pub mod protocol;
 
-pub mod tick;
 pub mod arbiter;
 pub mod desk;
+pub mod guard;
+pub mod indices;
+pub mod place;
+pub mod seat;
 pub mod select;
 pub mod swap;
-pub mod seat;
-pub mod guard;
-pub mod place;
-pub mod indices;
+pub mod tick;
 
 pub use component::{ComponentInfo, ComponentInfoError};
 pub use descriptor::{Descriptor, Direction, ParameterSpec, PortKind, PortSpec};
@@ -40,5 +40,5 @@ pub use intent::{Intent, IntentError};
 pub use name::{BusId, CellName, HostId, LoopId, NameError, PointId};
 pub use reading::{NoData, Quality, Reading};
 pub use record::{Applied, Command, CommandBody, CommandId, Event, Outcome, Record};
-pub use wiring::Wiring;
 pub use spec::{LoopSpec, Mode, OnFault, OutputLimit, Policy, SpecError, Strategy};
+pub use wiring::Wiring;

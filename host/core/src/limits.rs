@@ -48,4 +48,7 @@ pub const REPLICAS_MAX: usize = 16;
 /// Component size in bytes: a JavaScript engine in a component takes 13 MB.
 pub const COMPONENT_BYTES_MAX: usize = 32 * 1024 * 1024;
 
-const _: () = assert!(PORTS_MAX <= u64::BITS as usize, "the connected mask holds one bit per port");
+const _: () = assert!(
+    PORTS_MAX <= u64::BITS as usize,
+    "the connected mask holds one bit per port"
+);

@@ -42,13 +42,25 @@ fn check(what: &'static str, text: &str) -> Result<(), NameError> {
     }
     let chars = text.chars().count();
     if chars > NAME_CHARS_MAX {
-        return Err(NameError::TooLong { what, name: text.chars().take(NAME_CHARS_MAX).collect(), chars });
+        return Err(NameError::TooLong {
+            what,
+            name: text.chars().take(NAME_CHARS_MAX).collect(),
+            chars,
+        });
     }
     let allowed = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || matches!(c, '-' | '_' | '.');
     match text.chars().find(|&c| !allowed(c)) {
-        Some(found) => Err(NameError::Character { what, name: text.to_owned(), found }),
+        Some(found) => Err(NameError::Character {
+            what,
+            name: text.to_owned(),
+            found,
+        }),
         // A leading dot would hide a file, and `..` would leave a folder.
-        None if text.starts_with('.') => Err(NameError::Character { what, name: text.to_owned(), found: '.' }),
+        None if text.starts_with('.') => Err(NameError::Character {
+            what,
+            name: text.to_owned(),
+            found: '.',
+        }),
         None => Ok(()),
     }
 }
@@ -146,10 +158,21 @@ mod tests {
     #[test]
     fn names_are_checked_and_say_why() {
         assert!(LoopId::new("pressure-1").is_ok());
-        for (bad, part) in [("", "at least one"), ("Loop", "'L'"), ("a/b", "'/'"), ("../x", "'.'"), ("a b", "' '")] {
+        for (bad, part) in [
+            ("", "at least one"),
+            ("Loop", "'L'"),
+            ("a/b", "'/'"),
+            ("../x", "'.'"),
+            ("a b", "' '"),
+        ] {
             let error = LoopId::new(bad).expect_err(bad).to_string();
             assert!(error.contains(part), "{bad:?}: {error}");
         }
-        assert!(LoopId::new("x".repeat(65)).expect_err("too long").to_string().contains("65 characters"));
+        assert!(
+            LoopId::new("x".repeat(65))
+                .expect_err("too long")
+                .to_string()
+                .contains("65 characters")
+        );
     }
 }

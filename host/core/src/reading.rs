@@ -51,13 +51,25 @@ impl Reading {
     /// A good, fresh value.
     #[must_use]
     pub const fn good(value: f64, at_ns: u64) -> Self {
-        Self { value: Ok(value), last_good: value, quality: Quality::Good, at_ns, fresh: true }
+        Self {
+            value: Ok(value),
+            last_good: value,
+            quality: Quality::Good,
+            at_ns,
+            fresh: true,
+        }
     }
 
     /// No value, and why.
     #[must_use]
     pub const fn missing(reason: NoData, last_good: f64, at_ns: u64) -> Self {
-        Self { value: Err(reason), last_good, quality: Quality::Bad, at_ns, fresh: false }
+        Self {
+            value: Err(reason),
+            last_good,
+            quality: Quality::Bad,
+            at_ns,
+            fresh: false,
+        }
     }
 
     /// What an unconnected port reads.

@@ -67,7 +67,11 @@ pub fn settle(base: Option<&Record>, spec: &LoopSpec, sample: &Sample, held: &[f
         Some(r) => Standing {
             mode: r.mode,
             setpoint: r.setpoint,
-            manual: if r.mode == Mode::Manual && r.manual.len() == held.len() { r.manual.clone() } else { held.to_vec() },
+            manual: if r.mode == Mode::Manual && r.manual.len() == held.len() {
+                r.manual.clone()
+            } else {
+                held.to_vec()
+            },
             applied: r.applied.clone(),
             revise: None,
         },
@@ -139,7 +143,13 @@ impl Standing {
 
 /// The frame of a cycle.
 #[must_use]
-pub fn frame(base: Option<&Record>, spec: &LoopSpec, standing: &Standing, sample: &Sample, readings: Vec<Reading>) -> Frame {
+pub fn frame(
+    base: Option<&Record>,
+    spec: &LoopSpec,
+    standing: &Standing,
+    sample: &Sample,
+    readings: Vec<Reading>,
+) -> Frame {
     Frame {
         cycle: Cycle {
             seq: sample.seq,
@@ -186,14 +196,26 @@ impl Attempts {
     /// `hedge_ns`; at `here_at_ns` at the latest this host steps itself, so that the commit is never late for a replica.
     #[must_use]
     pub fn new(order: impl IntoIterator<Item = HostId>, here: HostId, hedge_ns: u64, here_at_ns: u64) -> Self {
-        Self { order: order.into_iter().collect(), here, here_done: false, hedge_ns, here_at_ns }
+        Self {
+            order: order.into_iter().collect(),
+            here,
+            here_done: false,
+            hedge_ns,
+            here_at_ns,
+        }
     }
 
     /// The next host to ask, after a silence or a fault, or at the start.
     pub fn next(&mut self, now_ns: u64) -> Ask {
-        let next = if now_ns >= self.here_at_ns && !self.here_done { None } else { self.order.pop_front() };
+        let next = if now_ns >= self.here_at_ns && !self.here_done {
+            None
+        } else {
+            self.order.pop_front()
+        };
         match next {
-            Some(host) if host != self.here => Ask::Remote(host, (now_ns + self.hedge_ns).min(self.here_at_ns.max(now_ns))),
+            Some(host) if host != self.here => {
+                Ask::Remote(host, (now_ns + self.hedge_ns).min(self.here_at_ns.max(now_ns)))
+            }
             _ if self.here_done => Ask::Nobody,
             _ => {
                 self.here_done = true;
@@ -247,11 +269,26 @@ pub struct Conclusion<'a> {
 /// Guards the outputs, or applies the policy where there is no good step, and writes the record to commit.
 #[must_use]
 pub fn conclude(c: Conclusion<'_>) -> Record {
-    let Conclusion { owner, sample, base, spec, wiring, readings, state, mut standing, mut events, probation, step, cycle_ns } = c;
+    let Conclusion {
+        owner,
+        sample,
+        base,
+        spec,
+        wiring,
+        readings,
+        state,
+        mut standing,
+        mut events,
+        probation,
+        step,
+        cycle_ns,
+    } = c;
     let dt_ns = dt_ns(base, spec, sample);
     let held = wiring.held(&readings);
     let faults_before = base.map_or(0, |r| r.faults_in_row);
-    let wanted_before = base.filter(|r| r.wanted.len() == held.len()).map_or_else(|| held.clone(), |r| r.wanted.clone());
+    let wanted_before = base
+        .filter(|r| r.wanted.len() == held.len())
+        .map_or_else(|| held.clone(), |r| r.wanted.clone());
     let (faults_in_row, wanted, outputs, effects, by, step_ns) = match step {
         Ok(Stepped { effects, by, step_ns }) => {
             let wanted = wiring.wanted(&effects.writes, &wanted_before);
@@ -272,7 +309,15 @@ pub fn conclude(c: Conclusion<'_>) -> Record {
             events.push(Event::PolicyHeld);
             let outputs = match (standing.mode, action) {
                 (Mode::Manual, _) => {
-                    guard::guard(Mode::Manual, &wanted_before, &standing.manual, &held, &wiring.limits, dt_ns).outputs
+                    guard::guard(
+                        Mode::Manual,
+                        &wanted_before,
+                        &standing.manual,
+                        &held,
+                        &wiring.limits,
+                        dt_ns,
+                    )
+                    .outputs
                 }
                 (Mode::Automatic, OnFault::SafeValue) => guard::towards_safe(&held, &wiring.limits, dt_ns),
                 (Mode::Automatic, OnFault::Hold) => guard::hold(&held, &wiring.limits),
@@ -282,15 +327,34 @@ pub fn conclude(c: Conclusion<'_>) -> Record {
                     standing.manual.clone()
                 }
             };
-            let effects = Effects { state: state.to_vec(), ..Effects::default() };
-            (if bad_input { faults_before } else { faults }, wanted_before, outputs, effects, owner.clone(), 0)
+            let effects = Effects {
+                state: state.to_vec(),
+                ..Effects::default()
+            };
+            (
+                if bad_input { faults_before } else { faults },
+                wanted_before,
+                outputs,
+                effects,
+                owner.clone(),
+                0,
+            )
         }
     };
     let finite = |values: Vec<f64>, or: &[f64]| -> Vec<f64> {
-        values.into_iter().zip(or).map(|(v, or)| if v.is_finite() { v } else { *or }).collect()
+        values
+            .into_iter()
+            .zip(or)
+            .map(|(v, or)| if v.is_finite() { v } else { *or })
+            .collect()
     };
     if let Some(before) = base.filter(|r| r.term != sample.term && r.owner != *owner) {
-        events.insert(0, Event::TookOver { from: Some(before.owner.clone()) });
+        events.insert(
+            0,
+            Event::TookOver {
+                from: Some(before.owner.clone()),
+            },
+        );
     } else if base.is_none() {
         events.insert(0, Event::TookOver { from: None });
     }

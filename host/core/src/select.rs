@@ -99,11 +99,13 @@ pub fn select(strategy: Strategy, candidates: &[Candidate], loop_id: &LoopId, se
     };
     // Candidates that are good enough come first and take turns; the others follow, best first.
     let take_turns = |order: &mut Vec<usize>, good: &dyn Fn(usize) -> bool, cost: &dyn Fn(usize) -> f64| {
-        order.sort_by(|&a, &b| good(b).cmp(&good(a)).then(if good(a) && good(b) {
-            a.cmp(&b)
-        } else {
-            cost(a).total_cmp(&cost(b))
-        }));
+        order.sort_by(|&a, &b| {
+            good(b).cmp(&good(a)).then(if good(a) && good(b) {
+                a.cmp(&b)
+            } else {
+                cost(a).total_cmp(&cost(b))
+            })
+        });
         let n = order.iter().take_while(|&&i| good(i)).count();
         if n > 1 {
             order[..n].rotate_left((seq % n as u64) as usize);
@@ -116,16 +118,23 @@ pub fn select(strategy: Strategy, candidates: &[Candidate], loop_id: &LoopId, se
         Strategy::Random => turn(&mut order, random),
         Strategy::Cpu => {
             let least = order.iter().map(|&i| candidates[i].cpu).fold(f32::INFINITY, f32::min);
-            take_turns(&mut order, &|i| candidates[i].cpu <= least + CPU_GOOD_ENOUGH, &|i| f64::from(candidates[i].cpu));
+            take_turns(&mut order, &|i| candidates[i].cpu <= least + CPU_GOOD_ENOUGH, &|i| {
+                f64::from(candidates[i].cpu)
+            });
         }
         Strategy::Latency => {
             let best = order.iter().map(|&i| latency(i)).fold(f64::INFINITY, f64::min);
-            take_turns(&mut order, &|i| latency(i) <= best + LATENCY_GOOD_ENOUGH_NS as f64, &latency);
+            take_turns(
+                &mut order,
+                &|i| latency(i) <= best + LATENCY_GOOD_ENOUGH_NS as f64,
+                &latency,
+            );
         }
         Strategy::P2c => {
             // Latency has the noise floor added, so that load decides among equals; load has a floor, so that latency does.
             let cost = |i: usize| {
-                (latency(i) + LATENCY_GOOD_ENOUGH_NS as f64) * (f64::from(candidates[i].cpu) + f64::from(CPU_GOOD_ENOUGH))
+                (latency(i) + LATENCY_GOOD_ENOUGH_NS as f64)
+                    * (f64::from(candidates[i].cpu) + f64::from(CPU_GOOD_ENOUGH))
             };
             turn(&mut order, random);
             if order.len() > 1 {
@@ -157,7 +166,14 @@ mod tests {
     use proptest::strategy::Strategy;
 
     fn candidate(n: usize, latency_ns: Option<u64>, cpu: f32, closed: bool, ready: bool) -> Candidate {
-        Candidate { host: HostId::new(format!("h{n}")).expect("valid"), here: n == 0, ready, closed, latency_ns, cpu }
+        Candidate {
+            host: HostId::new(format!("h{n}")).expect("valid"),
+            here: n == 0,
+            ready,
+            closed,
+            latency_ns,
+            cpu,
+        }
     }
 
     fn loop_id() -> LoopId {
@@ -165,8 +181,21 @@ mod tests {
     }
 
     fn any_candidates() -> impl Strategy<Value = Vec<Candidate>> {
-        prop::collection::vec((prop::option::of(0u64..50_000_000), 0.0f32..1.0, any::<bool>(), any::<bool>()), 0..12)
-            .prop_map(|v| v.into_iter().enumerate().map(|(n, (l, c, o, r))| candidate(n, l, c, o, r)).collect())
+        prop::collection::vec(
+            (
+                prop::option::of(0u64..50_000_000),
+                0.0f32..1.0,
+                any::<bool>(),
+                any::<bool>(),
+            ),
+            0..12,
+        )
+        .prop_map(|v| {
+            v.into_iter()
+                .enumerate()
+                .map(|(n, (l, c, o, r))| candidate(n, l, c, o, r))
+                .collect()
+        })
     }
 
     proptest! {

@@ -44,8 +44,15 @@ pub enum Strategy {
 
 impl Strategy {
     /// All of them, in the order in which they are documented.
-    pub const ALL: [Self; 7] =
-        [Self::RoundRobin, Self::Random, Self::Cpu, Self::Latency, Self::P2c, Self::Local, Self::Shard];
+    pub const ALL: [Self; 7] = [
+        Self::RoundRobin,
+        Self::Random,
+        Self::Cpu,
+        Self::Latency,
+        Self::P2c,
+        Self::Local,
+        Self::Shard,
+    ];
 
     /// The name used in configuration, API and command line.
     #[must_use]
@@ -65,7 +72,10 @@ impl Strategy {
 impl std::str::FromStr for Strategy {
     type Err = SpecError;
     fn from_str(text: &str) -> Result<Self, SpecError> {
-        Self::ALL.into_iter().find(|s| s.name() == text).ok_or_else(|| SpecError::Strategy(text.chars().take(64).collect()))
+        Self::ALL
+            .into_iter()
+            .find(|s| s.name() == text)
+            .ok_or_else(|| SpecError::Strategy(text.chars().take(64).collect()))
     }
 }
 
@@ -254,7 +264,11 @@ impl LoopSpec {
         let (low, high) = self.setpoint_range;
         let ordered = low.is_finite() && high.is_finite() && (low..=high).contains(&self.setpoint);
         if !ordered {
-            return Err(SpecError::Setpoint { setpoint: self.setpoint, low, high });
+            return Err(SpecError::Setpoint {
+                setpoint: self.setpoint,
+                low,
+                high,
+            });
         }
         for (port, l) in &self.limits {
             let rate_ok = l.rate_per_s.is_none_or(|r| r.is_finite() && r > 0.0);
@@ -271,7 +285,9 @@ impl LoopSpec {
             return Err(SpecError::Policy("hedge_part must be 0.01 to 0.9 of the period"));
         }
         if !(p.takeover_part > p.hedge_part && p.takeover_part <= 0.95) {
-            return Err(SpecError::Policy("takeover_part must be greater than hedge_part and at most 0.95 of the period"));
+            return Err(SpecError::Policy(
+                "takeover_part must be greater than hedge_part and at most 0.95 of the period",
+            ));
         }
         if !(p.bump_limit_percent >= 0.0 && p.bump_limit_percent.is_finite()) {
             return Err(SpecError::Policy("bump_limit_percent must be 0 or more"));
@@ -284,13 +300,27 @@ impl LoopSpec {
 
     /// Checks what the component says against what the loop connects and sets.
     pub fn check_against(&self, descriptor: &crate::Descriptor) -> Result<(), SpecError> {
-        let known = || descriptor.ports.iter().map(|p| p.name.as_str()).collect::<Vec<_>>().join(", ");
+        let known = || {
+            descriptor
+                .ports
+                .iter()
+                .map(|p| p.name.as_str())
+                .collect::<Vec<_>>()
+                .join(", ")
+        };
         for name in self.ports.keys().chain(self.limits.keys()) {
             if descriptor.port(name).is_none() {
-                return Err(SpecError::PortUnknown { name: name.clone(), known: known() });
+                return Err(SpecError::PortUnknown {
+                    name: name.clone(),
+                    known: known(),
+                });
             }
         }
-        if let Some(p) = descriptor.ports.iter().find(|p| p.required && !self.ports.contains_key(&p.name)) {
+        if let Some(p) = descriptor
+            .ports
+            .iter()
+            .find(|p| p.required && !self.ports.contains_key(&p.name))
+        {
             return Err(SpecError::PortMissing(p.name.clone()));
         }
         descriptor.parameter_values(self.parameters.iter().map(|(n, v)| (n.as_str(), *v)))?;

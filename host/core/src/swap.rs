@@ -9,10 +9,7 @@
 //!           (same cycle, old component, start from what the actuators hold)
 //! ```
 
-use crate::{
-    record::Record,
-    spec::LoopSpec,
-};
+use crate::{record::Record, spec::LoopSpec};
 
 /// How the controller's state comes over.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -46,13 +43,18 @@ pub fn bump_percent(old_outputs: &[f64], new_outputs: &[f64], spans: &[f64]) -> 
         .zip(spans)
         .map(|((old, new), span)| 100.0 * (new - old).abs() / span)
         // `max` would drop a NaN; a bump that cannot be told is not a small one.
-        .fold(0.0, |worst: f64, b| if b.is_nan() { f64::INFINITY } else { worst.max(b) })
+        .fold(
+            0.0,
+            |worst: f64, b| if b.is_nan() { f64::INFINITY } else { worst.max(b) },
+        )
 }
 
 /// The probation that the next record carries: it counts down and ends by itself.
 #[must_use]
 pub fn probation_after(before: Option<&Record>) -> Option<(u64, u32)> {
-    before.and_then(|r| r.probation).and_then(|(revision, left)| (left > 1).then(|| (revision, left - 1)))
+    before
+        .and_then(|r| r.probation)
+        .and_then(|(revision, left)| (left > 1).then(|| (revision, left - 1)))
 }
 
 #[cfg(test)]

@@ -31,7 +31,11 @@ impl Tick {
         let phase_ns = phase_ns % period_ns;
         let base = now_ns - now_ns % period_ns + phase_ns;
         let next_at_ns = if base > now_ns { base } else { base + period_ns };
-        Self { period_ns, next_at_ns, next_seq: first_seq }
+        Self {
+            period_ns,
+            next_at_ns,
+            next_seq: first_seq,
+        }
     }
 
     /// The next deadline, in ns.

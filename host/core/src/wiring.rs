@@ -10,7 +10,12 @@ use crate::{
 };
 
 /// What an output port without a point may do: anything finite, for it moves nothing.
-const UNCONNECTED_LIMIT: OutputLimit = OutputLimit { low: f64::MIN, high: f64::MAX, rate_per_s: None, safe: 0.0 };
+const UNCONNECTED_LIMIT: OutputLimit = OutputLimit {
+    low: f64::MIN,
+    high: f64::MAX,
+    rate_per_s: None,
+    safe: 0.0,
+};
 
 /// One revision's ports, parameters and bounds, by number.
 #[derive(Debug, Clone, PartialEq)]
@@ -33,22 +38,40 @@ impl Wiring {
     /// Resolves a specification. Every connected output must have limits: the home fills in its point's range.
     pub fn new(spec: &LoopSpec, descriptor: &Descriptor) -> Result<Self, SpecError> {
         spec.check_against(descriptor)?;
-        let points: Vec<Option<PointId>> = descriptor.ports.iter().map(|p| spec.ports.get(&p.name).cloned()).collect();
+        let points: Vec<Option<PointId>> = descriptor
+            .ports
+            .iter()
+            .map(|p| spec.ports.get(&p.name).cloned())
+            .collect();
         let mut limits = Vec::new();
         for (i, port) in descriptor.outputs() {
             limits.push(match (spec.limits.get(&port.name), &points[i]) {
                 (Some(limit), _) => *limit,
                 (None, None) => UNCONNECTED_LIMIT,
-                (None, Some(_)) => return Err(SpecError::Limit { port: port.name.clone() }),
+                (None, Some(_)) => {
+                    return Err(SpecError::Limit {
+                        port: port.name.clone(),
+                    });
+                }
             });
         }
         let numbered = |wanted: &dyn Fn(usize, &crate::PortSpec) -> bool| {
-            descriptor.ports.iter().enumerate().filter(|(i, p)| wanted(*i, p)).map(|(i, _)| i as u8).collect::<Vec<u8>>()
+            descriptor
+                .ports
+                .iter()
+                .enumerate()
+                .filter(|(i, p)| wanted(*i, p))
+                .map(|(i, _)| i as u8)
+                .collect::<Vec<u8>>()
         };
         Ok(Self {
             outputs: numbered(&|_, p| p.direction == Direction::Output),
             required_inputs: numbered(&|_, p| p.direction == Direction::Input && p.required),
-            connected: points.iter().enumerate().filter(|(_, p)| p.is_some()).fold(0, |mask, (i, _)| mask | 1 << i),
+            connected: points
+                .iter()
+                .enumerate()
+                .filter(|(_, p)| p.is_some())
+                .fold(0, |mask, (i, _)| mask | 1 << i),
             parameters: descriptor.parameter_values(spec.parameters.iter().map(|(n, v)| (n.as_str(), *v)))?,
             points,
             limits,
@@ -84,14 +107,20 @@ impl Wiring {
     /// Span of an output, in its unit; 100 where it has none, so that a percentage still means something.
     #[must_use]
     pub fn span(&self, output: usize) -> f64 {
-        self.limits.get(output).map(|l| l.high - l.low).filter(|s| s.is_finite() && *s > 0.0).unwrap_or(100.0)
+        self.limits
+            .get(output)
+            .map(|l| l.high - l.low)
+            .filter(|s| s.is_finite() && *s > 0.0)
+            .unwrap_or(100.0)
     }
 
     /// The first required input without a usable value.
     #[must_use]
     pub fn bad_input(&self, readings: &[Reading]) -> Option<u8> {
         self.required_inputs.iter().copied().find(|&port| {
-            readings.get(usize::from(port)).is_none_or(|r| r.quality == crate::Quality::Bad || r.value.is_err())
+            readings
+                .get(usize::from(port))
+                .is_none_or(|r| r.quality == crate::Quality::Bad || r.value.is_err())
         })
     }
 

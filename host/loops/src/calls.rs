@@ -57,14 +57,19 @@ pub(crate) struct Calls {
 impl Worker {
     pub(crate) fn call(&mut self, request: CallRequest) {
         if self.calls.pending.len() >= CALLS_MAX {
-            return (request.reply)(Err(Fault::Limit(format!("{CALLS_MAX} calls are on their way; try again"))));
+            return (request.reply)(Err(Fault::Limit(format!(
+                "{CALLS_MAX} calls are on their way; try again"
+            ))));
         }
         let now_ns = self.shared.now_ns();
         let mut members = self.shared.replicas.alive();
         if !members.contains(&self.shared.here) {
             members.push(self.shared.here.clone());
         }
-        let mut candidates = self.shared.replicas.candidates(&members, &self.shared.here, &request.digest, now_ns);
+        let mut candidates = self
+            .shared
+            .replicas
+            .candidates(&members, &self.shared.here, &request.digest, now_ns);
         let prepared_here = self.shared.engine.prepared(&request.digest).is_some();
         for candidate in candidates.iter_mut().filter(|c| c.here) {
             candidate.ready = prepared_here;
@@ -76,8 +81,12 @@ impl Worker {
             .filter_map(|i| candidates.get(i).map(|c| c.host.clone()))
             .collect();
         let limit_ns = request.limit_ns;
-        let attempts =
-            Attempts::new(order, self.shared.here.clone(), HEDGE_NS + limit_ns, now_ns + HERE_NS + limit_ns);
+        let attempts = Attempts::new(
+            order,
+            self.shared.here.clone(),
+            HEDGE_NS + limit_ns,
+            now_ns + HERE_NS + limit_ns,
+        );
         let pending = Pending {
             request,
             attempts,
@@ -145,7 +154,9 @@ impl Worker {
     /// A replica's time is up.
     pub(crate) fn call_due(&mut self, correlation: u64, now_ns: u64) {
         if let Some(pending) = self.calls.pending.remove(&correlation) {
-            self.shared.replicas.silent(&pending.asked, now_ns, now_ns.saturating_sub(pending.asked_at_ns));
+            self.shared
+                .replicas
+                .silent(&pending.asked, now_ns, now_ns.saturating_sub(pending.asked_at_ns));
             self.advance_call(pending);
         }
     }
@@ -153,12 +164,16 @@ impl Worker {
     /// A replica answered.
     pub(crate) fn call_answer(&mut self, answer: StepAnswer) {
         let now_ns = self.shared.now_ns();
-        let Some(mut pending) = self.calls.pending.remove(&answer.correlation) else { return };
+        let Some(mut pending) = self.calls.pending.remove(&answer.correlation) else {
+            return;
+        };
         if pending.asked != answer.from {
             self.calls.pending.insert(answer.correlation, pending);
             return;
         }
-        self.shared.replicas.answered(&answer.from, now_ns.saturating_sub(pending.asked_at_ns));
+        self.shared
+            .replicas
+            .answered(&answer.from, now_ns.saturating_sub(pending.asked_at_ns));
         match &answer.result {
             Ok(_) => end(pending.request.reply, answer, now_ns - pending.started_ns),
             // The component's own fault would be the same everywhere; only a host that is not ready is worth another try.
@@ -179,7 +194,10 @@ impl Worker {
         limit_ns: u64,
     ) -> Result<Effects, Fault> {
         let here = &self.shared.here;
-        let not_ready = |reason: String| Fault::NotReady { host: here.to_string(), reason };
+        let not_ready = |reason: String| Fault::NotReady {
+            host: here.to_string(),
+            reason,
+        };
         if !self.calls.instances.contains_key(digest) {
             let prepared = self
                 .shared
@@ -188,7 +206,12 @@ impl Worker {
                 .ok_or_else(|| not_ready("the component is not compiled here".to_owned()))?;
             let instance = prepared.instantiate().map_err(|error| not_ready(error.to_string()))?;
             if self.calls.instances.len() >= INSTANCES_MAX {
-                let least = self.calls.instances.iter().min_by_key(|(_, (_, used))| *used).map(|(d, _)| *d);
+                let least = self
+                    .calls
+                    .instances
+                    .iter()
+                    .min_by_key(|(_, (_, used))| *used)
+                    .map(|(d, _)| *d);
                 if let Some((old, _)) = least.and_then(|d| self.calls.instances.remove(&d)) {
                     self.shared.bury(old);
                 }
@@ -210,8 +233,18 @@ fn end(reply: ReplyToCall, answer: StepAnswer, total_ns: u64) {
 }
 
 fn empty_frame() -> Frame {
-    let cycle = bumpless_core::Cycle { seq: 0, at_ns: 0, dt_ns: 1, mode: bumpless_core::Mode::Automatic, setpoint: 0.0 };
-    Frame { cycle, readings: Vec::new(), messages: Vec::new() }
+    let cycle = bumpless_core::Cycle {
+        seq: 0,
+        at_ns: 0,
+        dt_ns: 1,
+        mode: bumpless_core::Mode::Automatic,
+        setpoint: 0.0,
+    };
+    Frame {
+        cycle,
+        readings: Vec::new(),
+        messages: Vec::new(),
+    }
 }
 
 #[allow(clippy::expect_used, reason = "a constant that a test checks")]

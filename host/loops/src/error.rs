@@ -9,7 +9,9 @@ pub enum Error {
     #[error("host {0} serves no points, so no loop can have its home here: give it a bus in its configuration")]
     NoIo(HostId),
     /// A point is not served here.
-    #[error("loop {loop_id}: point {point} is not served by this host; all points of a loop must be served by its home")]
+    #[error(
+        "loop {loop_id}: point {point} is not served by this host; all points of a loop must be served by its home"
+    )]
     NoSuchPoint {
         /// The loop.
         loop_id: LoopId,

@@ -85,6 +85,15 @@ pub(crate) struct CallRequest {
     pub(crate) reply: ReplyToCall,
 }
 
+/// A home to open.
+pub(crate) struct Opening {
+    pub(crate) revision: HomeRevision,
+    /// The record to go on from.
+    pub(crate) last: Option<Arc<Record>>,
+    /// Where the home shows itself.
+    pub(crate) view: Arc<Mutex<HomeView>>,
+}
+
 /// Everything that reaches a worker.
 pub(crate) enum Event {
     Sample(Box<Sample>),
@@ -94,7 +103,7 @@ pub(crate) enum Event {
     StepAnswer(Box<StepAnswer>),
     Ping { from: HostId, token: u64 },
     HostGone(HostId),
-    OpenHome(Box<(HomeRevision, Option<Arc<Record>>, Arc<Mutex<HomeView>>)>),
+    OpenHome(Box<Opening>),
     AddHomeRevision(Box<HomeRevision>),
     CloseHome(LoopId),
     Members(LoopId, Vec<HostId>),

@@ -14,9 +14,7 @@ use std::{
 };
 
 use bumpless_cell::{Arrival, Vitals};
-use bumpless_core::{
-    Command, CommandId, Digest, Fault, Frame, HostId, LoopId, Record, Strategy, limits::REPLICAS_MAX,
-};
+use bumpless_core::{Command, CommandId, Digest, Fault, Frame, HostId, LoopId, Record, Strategy, limits::REPLICAS_MAX};
 use bumpless_engine::{Engine, Instance};
 use bumpless_io::{Clock, IoServer};
 use crossbeam_channel::{Sender, TrySendError};
@@ -24,7 +22,7 @@ use parking_lot::{Mutex, RwLock};
 
 use crate::{
     error::Error,
-    event::{CallEnd, CallRequest, CommandReply, Event, HeldRevision, HomeRevision, LoopsEvent},
+    event::{CallEnd, CallRequest, CommandReply, Event, HeldRevision, HomeRevision, LoopsEvent, Opening},
     home::HomeView,
     replicas::Replicas,
     shared::Shared,
@@ -49,7 +47,9 @@ pub struct Config {
 impl Default for Config {
     fn default() -> Self {
         let processors = std::thread::available_parallelism().map_or(2, usize::from);
-        Self { workers: (2 * processors).clamp(2, 16) }
+        Self {
+            workers: (2 * processors).clamp(2, 16),
+        }
     }
 }
 
@@ -130,7 +130,9 @@ impl Loops {
 
     /// From the bus: a full inbox drops it, and the silence is noticed by whoever waits.
     fn offer(&self, index: usize, event: Event) {
-        let Some(inbox) = self.inner.inboxes.get(index) else { return };
+        let Some(inbox) = self.inner.inboxes.get(index) else {
+            return;
+        };
         if let Err(TrySendError::Full(_)) = inbox.try_send(event) {
             self.inner.shared.dropped.fetch_add(1, Ordering::Relaxed);
         }
@@ -138,7 +140,9 @@ impl Loops {
 
     /// From deployment: tells whether it was taken.
     fn hand(&self, id: &LoopId, event: Event) -> Result<(), Error> {
-        self.inner.inboxes[self.place(id)].try_send(event).map_err(|_| Error::Busy)
+        self.inner.inboxes[self.place(id)]
+            .try_send(event)
+            .map_err(|_| Error::Busy)
     }
 
     /// Takes what is the loops' from the bus, and gives back what is not. Never blocks.
@@ -167,7 +171,10 @@ impl Loops {
                 self.offer(index, Event::Ping { from, token });
             }
             Arrival::Pong { from, token } => {
-                self.inner.shared.replicas.probed(&from, token, self.inner.shared.now_ns());
+                self.inner
+                    .shared
+                    .replicas
+                    .probed(&from, token, self.inner.shared.now_ns());
             }
             Arrival::HostDown(host) => {
                 self.host_gone(&host);
@@ -193,7 +200,14 @@ impl Loops {
         self.check_points(&revision)?;
         let id = revision.spec.id.clone();
         let view = Arc::new(Mutex::new(HomeView::default()));
-        self.hand(&id, Event::OpenHome(Box::new((revision, last, Arc::clone(&view)))))?;
+        self.hand(
+            &id,
+            Event::OpenHome(Box::new(Opening {
+                revision,
+                last,
+                view: Arc::clone(&view),
+            })),
+        )?;
         self.inner.views.write().insert(id, view);
         Ok(())
     }
@@ -206,9 +220,14 @@ impl Loops {
     }
 
     fn check_points(&self, revision: &HomeRevision) -> Result<(), Error> {
-        let Some(io) = &self.inner.shared.io else { return Err(Error::NoIo(self.inner.shared.here.clone())) };
+        let Some(io) = &self.inner.shared.io else {
+            return Err(Error::NoIo(self.inner.shared.here.clone()));
+        };
         match revision.wiring.points.iter().flatten().find(|p| io.index(p).is_none()) {
-            Some(point) => Err(Error::NoSuchPoint { loop_id: revision.spec.id.clone(), point: point.clone() }),
+            Some(point) => Err(Error::NoSuchPoint {
+                loop_id: revision.spec.id.clone(),
+                point: point.clone(),
+            }),
             None => Ok(()),
         }
     }
@@ -227,7 +246,12 @@ impl Loops {
 
     /// Hands a command to the loop's home here. `reply` is called once, from the loop's worker, when a record holds the
     /// outcome; it is dropped uncalled where the command was withdrawn or the host stops.
-    pub fn command(&self, id: &LoopId, command: Command, reply: Box<dyn FnOnce(CommandReply) + Send>) -> Result<(), Error> {
+    pub fn command(
+        &self,
+        id: &LoopId,
+        command: Command,
+        reply: Box<dyn FnOnce(CommandReply) + Send>,
+    ) -> Result<(), Error> {
         self.hand(id, Event::Command(id.clone(), Box::new(command), reply))
     }
 
@@ -281,8 +305,17 @@ impl Loops {
         reply: Box<dyn FnOnce(Result<CallEnd, Fault>) + Send>,
     ) -> Result<(), Error> {
         let turn = self.inner.next_call.fetch_add(1, Ordering::Relaxed) as usize % self.inner.inboxes.len();
-        let request = CallRequest { digest, strategy, frame, state, limit_ns, reply };
-        self.inner.inboxes[turn].try_send(Event::Call(Box::new(request))).map_err(|_| Error::Busy)
+        let request = CallRequest {
+            digest,
+            strategy,
+            frame,
+            state,
+            limit_ns,
+            reply,
+        };
+        self.inner.inboxes[turn]
+            .try_send(Event::Call(Box::new(request)))
+            .map_err(|_| Error::Busy)
     }
 
     /// What a home here looks like now.

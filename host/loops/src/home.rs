@@ -18,7 +18,7 @@ use bumpless_io::{PointIndex, WriteStamp};
 use parking_lot::Mutex;
 
 use crate::{
-    event::{CommandReply, HomeRevision, LoopsEvent, ReplyToCommand},
+    event::{CommandReply, HomeRevision, LoopsEvent, Opening, ReplyToCommand},
     worker::{Timer, Worker},
 };
 
@@ -87,10 +87,14 @@ impl Worker {
     fn known_revision(&self, revision: HomeRevision) -> Known {
         // `Loops::open_home` and `add_home_revision` have checked that every point is served here.
         let index = |p: &Option<bumpless_core::PointId>| p.as_ref().and_then(|p| self.shared.io.as_ref()?.index(p));
-        Known { points: revision.wiring.points.iter().map(index).collect(), revision }
+        Known {
+            points: revision.wiring.points.iter().map(index).collect(),
+            revision,
+        }
     }
 
-    pub(crate) fn open_home(&mut self, revision: HomeRevision, last: Option<Arc<Record>>, view: Arc<Mutex<HomeView>>) {
+    pub(crate) fn open_home(&mut self, opening: Opening) {
+        let Opening { revision, last, view } = opening;
         let id = revision.spec.id.clone();
         let spec = Arc::clone(&revision.spec);
         let known = self.known_revision(revision);
@@ -110,7 +114,9 @@ impl Worker {
 
     pub(crate) fn add_home_revision(&mut self, revision: HomeRevision) {
         let known = self.known_revision(revision);
-        let Some(home) = self.homes.get_mut(&known.revision.spec.id) else { return };
+        let Some(home) = self.homes.get_mut(&known.revision.spec.id) else {
+            return;
+        };
         let number = known.revision.spec.revision;
         home.known.retain(|k| k.revision.spec.revision != number);
         home.known.push(known);
@@ -147,13 +153,18 @@ impl Worker {
     }
 
     pub(crate) fn command(&mut self, id: &LoopId, command: Command, reply: ReplyToCommand) {
-        let Some(home) = self.homes.get_mut(id) else { return reply(CommandReply::NoSuchLoop) };
+        let Some(home) = self.homes.get_mut(id) else {
+            return reply(CommandReply::NoSuchLoop);
+        };
         let command_id = command.id;
         match home.desk.command(command) {
             Queued::Waits => home.waiters.push((command_id, reply)),
             Queued::Full => reply(CommandReply::Full),
             Queued::Ended(applied) => match home.desk.last() {
-                Some(record) => reply(CommandReply::Applied { applied, record: Arc::clone(record) }),
+                Some(record) => reply(CommandReply::Applied {
+                    applied,
+                    record: Arc::clone(record),
+                }),
                 None => reply(CommandReply::NoSuchLoop),
             },
         }
@@ -173,7 +184,9 @@ impl Worker {
     }
 
     fn deadline(&mut self, id: &LoopId) {
-        let (Some(home), Some(io)) = (self.homes.get_mut(id), self.shared.io.as_ref()) else { return };
+        let (Some(home), Some(io)) = (self.homes.get_mut(id), self.shared.io.as_ref()) else {
+            return;
+        };
         let now_ns = self.shared.clock.now_ns();
         let due_ns = home.desk.deadline_at_ns();
         if now_ns < due_ns {
@@ -184,8 +197,13 @@ impl Worker {
             io.read(&known.points, now_ns, &mut readings);
             readings
         };
-        let Some(readings) = home.known(home.desk.spec().revision).map(read) else { return };
-        let next = home.desk.waiting_revision().and_then(|r| home.known(r).map(|known| (r, read(known))));
+        let Some(readings) = home.known(home.desk.spec().revision).map(read) else {
+            return;
+        };
+        let next = home
+            .desk
+            .waiting_revision()
+            .and_then(|r| home.known(r).map(|known| (r, read(known))));
         let fired = home.desk.deadline(now_ns, readings, next);
         {
             let mut view = home.view.lock();
@@ -230,7 +248,9 @@ impl Worker {
     fn commit(&mut self, record: Record) {
         let id = record.loop_id.clone();
         let now_ns = self.shared.now_ns();
-        let (Some(home), Some(io)) = (self.homes.get_mut(&id), self.shared.io.as_ref()) else { return };
+        let (Some(home), Some(io)) = (self.homes.get_mut(&id), self.shared.io.as_ref()) else {
+            return;
+        };
         if let Err(refusal) = home.desk.check(&record) {
             tracing::debug!(loop_id = %id, owner = %record.owner, term = record.term, seq = record.seq, %refusal, "commit refused");
             home.publish_view();
@@ -240,11 +260,17 @@ impl Worker {
         writes.clear();
         let fits = home.known(record.revision).is_some_and(|known| {
             let outputs = &known.revision.wiring.outputs;
-            let points = outputs.iter().map(|&port| known.points.get(usize::from(port)).copied().flatten());
+            let points = outputs
+                .iter()
+                .map(|&port| known.points.get(usize::from(port)).copied().flatten());
             writes.extend(points.zip(&record.outputs).filter_map(|(p, v)| p.map(|p| (p, *v))));
             outputs.len() == record.outputs.len()
         });
-        let stamp = WriteStamp { loop_id: record.loop_id.clone(), term: record.term, seq: record.seq };
+        let stamp = WriteStamp {
+            loop_id: record.loop_id.clone(),
+            term: record.term,
+            seq: record.seq,
+        };
         let written = fits.then(|| io.write(&writes, &stamp, now_ns));
         home.writes = writes;
         match written {
@@ -267,13 +293,19 @@ impl Worker {
         for applied in &record.applied {
             while let Some(i) = home.waiters.iter().position(|(waiting, _)| *waiting == applied.id) {
                 let (_, reply) = home.waiters.swap_remove(i);
-                reply(CommandReply::Applied { applied: applied.clone(), record: Arc::clone(&record) });
+                reply(CommandReply::Applied {
+                    applied: applied.clone(),
+                    record: Arc::clone(&record),
+                });
             }
         }
         home.publish_view();
         self.shared.wire.publish_record(&record);
         if revised {
-            (self.shared.sink)(LoopsEvent::Revised { loop_id: id.clone(), revision: record.revision });
+            (self.shared.sink)(LoopsEvent::Revised {
+                loop_id: id.clone(),
+                revision: record.revision,
+            });
         }
         (self.shared.sink)(LoopsEvent::Record(Arc::clone(&record)));
         self.record(&record);

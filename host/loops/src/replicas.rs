@@ -64,7 +64,12 @@ impl Replicas {
 
     /// The hosts to probe now, each with a token to send. A probe that got lost counts as a failure first.
     pub(crate) fn probes(&self, now_ns: u64) -> Vec<(HostId, u64)> {
-        let hosts: Vec<_> = self.hosts.read().iter().map(|(h, r)| (h.clone(), Arc::clone(r))).collect();
+        let hosts: Vec<_> = self
+            .hosts
+            .read()
+            .iter()
+            .map(|(h, r)| (h.clone(), Arc::clone(r)))
+            .collect();
         let mut due = Vec::new();
         for (host, entry) in hosts {
             let mut replica = entry.lock();
@@ -129,8 +134,13 @@ impl Replicas {
 
     /// Every host that is known to be alive.
     pub(crate) fn alive(&self) -> Vec<HostId> {
-        let mut hosts: Vec<HostId> =
-            self.hosts.read().iter().filter(|(_, r)| r.lock().alive).map(|(h, _)| h.clone()).collect();
+        let mut hosts: Vec<HostId> = self
+            .hosts
+            .read()
+            .iter()
+            .filter(|(_, r)| r.lock().alive)
+            .map(|(h, _)| h.clone())
+            .collect();
         hosts.sort_unstable();
         hosts
     }

@@ -76,7 +76,9 @@ impl Seat {
     }
 
     pub(crate) fn waits_for(&self, host: &HostId) -> bool {
-        self.running.as_ref().is_some_and(|r| r.asked.iter().any(|a| a.host == *host))
+        self.running
+            .as_ref()
+            .is_some_and(|r| r.asked.iter().any(|a| a.host == *host))
     }
 }
 
@@ -88,17 +90,25 @@ fn take_over(
     limit_ns: u64,
 ) -> Result<(Vec<u8>, &'static str), Fault> {
     if let Some((origin, state)) = from.filter(|(_, state)| !state.is_empty())
-        && let Ok(state) = held.instance.migrate(origin, state, &held.wiring.parameters, track, limit_ns)
+        && let Ok(state) = held
+            .instance
+            .migrate(origin, state, &held.wiring.parameters, track, limit_ns)
     {
         return Ok((state, "migrate"));
     }
-    held.instance.start(&held.wiring.parameters, track, limit_ns).map(|state| (state, "start"))
+    held.instance
+        .start(&held.wiring.parameters, track, limit_ns)
+        .map(|state| (state, "start"))
 }
 
 /// What the actuators hold, with the safe value where that is not known.
 fn track(held: &HeldRevision, readings: &[Reading]) -> Vec<f64> {
     let values = held.wiring.held(readings);
-    values.iter().zip(&held.wiring.limits).map(|(v, l)| if v.is_finite() { *v } else { l.safe }).collect()
+    values
+        .iter()
+        .zip(&held.wiring.limits)
+        .map(|(v, l)| if v.is_finite() { *v } else { l.safe })
+        .collect()
 }
 
 fn origin(held: &HeldRevision) -> Origin {
@@ -110,7 +120,11 @@ fn origin(held: &HeldRevision) -> Origin {
 }
 
 fn missing_input(held: &HeldRevision, port: u8) -> Fault {
-    let name = held.descriptor.ports.get(usize::from(port)).map_or_else(|| port.to_string(), |p| p.name.clone());
+    let name = held
+        .descriptor
+        .ports
+        .get(usize::from(port))
+        .map_or_else(|| port.to_string(), |p| p.name.clone());
     Fault::BadInput(format!("{name} has no usable value"))
 }
 
@@ -132,7 +146,10 @@ impl Worker {
     pub(crate) fn keep_revisions(&mut self, id: &LoopId, keep: &[u64]) {
         let Some(seat) = self.seats.get_mut(id) else { return };
         // What a cycle needs now, or a probation may need, stays whatever is asked.
-        let in_force = seat.last.as_ref().map(|r| (r.revision, r.probation.map(|(revision, _)| revision)));
+        let in_force = seat
+            .last
+            .as_ref()
+            .map(|r| (r.revision, r.probation.map(|(revision, _)| revision)));
         let (stay, go): (Vec<_>, Vec<_>) = std::mem::take(&mut seat.held).into_iter().partition(|h| {
             let n = h.spec.revision;
             keep.contains(&n) || in_force.is_some_and(|(now, back)| n == now || Some(n) == back)
@@ -157,14 +174,28 @@ impl Worker {
 
     /// A record was taken, here or elsewhere.
     pub(crate) fn record(&mut self, record: &Arc<Record>) {
-        let Some(seat) = self.seats.get_mut(&record.loop_id) else { return };
-        if seat.last.as_ref().is_some_and(|last| last.position() >= record.position()) {
+        let Some(seat) = self.seats.get_mut(&record.loop_id) else {
+            return;
+        };
+        if seat
+            .last
+            .as_ref()
+            .is_some_and(|last| last.position() >= record.position())
+        {
             return;
         }
-        if seat.inflight.as_ref().is_some_and(|r| r.position() <= record.position()) {
+        if seat
+            .inflight
+            .as_ref()
+            .is_some_and(|r| r.position() <= record.position())
+        {
             seat.inflight = None;
         }
-        if seat.running.as_ref().is_some_and(|r| (r.sample.term, r.sample.seq) <= record.position()) {
+        if seat
+            .running
+            .as_ref()
+            .is_some_and(|r| (r.sample.term, r.sample.seq) <= record.position())
+        {
             seat.running = None;
         }
         let owned = record.owner == self.shared.here;
@@ -206,7 +237,9 @@ impl Worker {
         }
         let started_ns = self.shared.now_ns();
         let id = sample.loop_id.clone();
-        let Some(seat) = self.seats.get_mut(&id) else { return self.decline(&sample, "the loop is not held here") };
+        let Some(seat) = self.seats.get_mut(&id) else {
+            return self.decline(&sample, "the loop is not held here");
+        };
         seat.running = None;
         let base = match seat::base(&sample, seat.last.iter().chain(&seat.inflight)) {
             Base::First => None,
@@ -234,7 +267,9 @@ impl Worker {
         let frame = seat::frame(base.as_deref(), &held.spec, &standing, &sample, sample.readings.clone());
         let mut events = Vec::new();
         let bad_input = held.wiring.bad_input(&sample.readings);
-        let carried = base.as_ref().filter(|r| r.digest == held.spec.digest && !r.state.is_empty());
+        let carried = base
+            .as_ref()
+            .filter(|r| r.digest == held.spec.digest && !r.state.is_empty());
         let state: Result<Arc<[u8]>, Fault> = match carried {
             Some(record) => Ok(Arc::clone(&record.state)),
             None => take_over(held, None, &actuators, limit_ns).map(|(state, _)| Arc::from(state)),
@@ -245,7 +280,10 @@ impl Worker {
                 Some(missing_input(held, port))
             }
             (Err(fault), None) => {
-                events.push(CycleEvent::Faulted { replica: self.shared.here.clone(), fault: fault.to_string() });
+                events.push(CycleEvent::Faulted {
+                    replica: self.shared.here.clone(),
+                    fault: fault.to_string(),
+                });
                 Some(fault.clone())
             }
             (Ok(_), None) => None,
@@ -258,7 +296,10 @@ impl Worker {
         let order = if fault.is_some() || standing.revise.is_some() {
             Vec::new()
         } else {
-            let candidates = self.shared.replicas.candidates(&sample.members, &self.shared.here, &digest, started_ns);
+            let candidates = self
+                .shared
+                .replicas
+                .candidates(&sample.members, &self.shared.here, &digest, started_ns);
             let random = self.random();
             select::select(strategy, &candidates, &id, period_seq, random)
                 .into_iter()
@@ -266,7 +307,10 @@ impl Worker {
                 .map(|c| (c.host.clone(), c.latency_ns))
                 .collect()
         };
-        let usual_ns = order.first().and_then(|(_, l)| *l).map_or(hedge_ns, |l| l.saturating_mul(HEDGE_LATENCIES));
+        let usual_ns = order
+            .first()
+            .and_then(|(_, l)| *l)
+            .map_or(hedge_ns, |l| l.saturating_mul(HEDGE_LATENCIES));
         let hedge_ns = hedge_ns.min(usual_ns.max(HEDGE_NS_MIN));
         let order = order.into_iter().map(|(host, _)| host);
         let running = Running {
@@ -299,7 +343,9 @@ impl Worker {
             match running.attempts.next(now_ns) {
                 Ask::Remote(host, until_ns) => {
                     let Some(seat) = self.seats.get(id) else { return };
-                    let Some(held) = seat.held.iter().find(|h| h.spec.revision == running.sample.revision) else { return };
+                    let Some(held) = seat.held.iter().find(|h| h.spec.revision == running.sample.revision) else {
+                        return;
+                    };
                     let (digest, limit_ns) = (held.spec.digest, held.spec.step_limit_ns());
                     let correlation = self.correlation();
                     let request = StepRequest {
@@ -312,11 +358,17 @@ impl Worker {
                         state: Arc::clone(&running.state),
                     };
                     self.shared.wire.send_step(&host, &request);
-                    running.asked.push(Asked { correlation, host, at_ns: now_ns });
+                    running.asked.push(Asked {
+                        correlation,
+                        host,
+                        at_ns: now_ns,
+                    });
                     return self.wait(id, running, until_ns);
                 }
                 Ask::Here => {
-                    let Some(held) = self.seats.get_mut(id).and_then(|s| s.held(running.sample.revision)) else { return };
+                    let Some(held) = self.seats.get_mut(id).and_then(|s| s.held(running.sample.revision)) else {
+                        return;
+                    };
                     let limit_ns = held.spec.step_limit_ns();
                     let began_ns = self.shared.now_ns();
                     match held.instance.step(&running.frame, &running.state, limit_ns) {
@@ -327,7 +379,10 @@ impl Worker {
                         }
                         Err(fault) => {
                             let replica = self.shared.here.clone();
-                            running.events.push(CycleEvent::Faulted { replica, fault: fault.to_string() });
+                            running.events.push(CycleEvent::Faulted {
+                                replica,
+                                fault: fault.to_string(),
+                            });
                             running.fault = Some(fault);
                         }
                     }
@@ -357,10 +412,16 @@ impl Worker {
     /// A replica's time is up.
     pub(crate) fn seat_due(&mut self, id: &LoopId, at_ns: u64, now_ns: u64) {
         let Some(seat) = self.seats.get_mut(id) else { return };
-        let Some(mut running) = seat.running.take_if(|r| r.next_at_ns == at_ns) else { return };
+        let Some(mut running) = seat.running.take_if(|r| r.next_at_ns == at_ns) else {
+            return;
+        };
         if let Some(asked) = running.asked.last() {
-            self.shared.replicas.silent(&asked.host, now_ns, now_ns.saturating_sub(asked.at_ns));
-            running.events.push(CycleEvent::Hedged { replica: asked.host.clone() });
+            self.shared
+                .replicas
+                .silent(&asked.host, now_ns, now_ns.saturating_sub(asked.at_ns));
+            running.events.push(CycleEvent::Hedged {
+                replica: asked.host.clone(),
+            });
         }
         self.advance(id, running);
     }
@@ -383,28 +444,45 @@ impl Worker {
     pub(crate) fn step_answer(&mut self, answer: StepAnswer) {
         let now_ns = self.shared.now_ns();
         let id = answer.loop_id.clone();
-        let Some(seat) = self.seats.get_mut(&id) else { return self.call_answer(answer) };
+        let Some(seat) = self.seats.get_mut(&id) else {
+            return self.call_answer(answer);
+        };
         let of_this = |a: &Asked| a.correlation == answer.correlation && a.host == answer.from;
         let Some(mut running) = seat.running.take_if(|r| r.asked.iter().any(of_this)) else {
             if let Some(i) = seat.recent.iter().position(of_this)
                 && let Some(asked) = seat.recent.remove(i)
             {
-                self.shared.replicas.answered(&asked.host, now_ns.saturating_sub(asked.at_ns));
+                self.shared
+                    .replicas
+                    .answered(&asked.host, now_ns.saturating_sub(asked.at_ns));
             }
             return;
         };
-        let Some(i) = running.asked.iter().position(of_this) else { return };
+        let Some(i) = running.asked.iter().position(of_this) else {
+            return;
+        };
         let asked = running.asked.remove(i);
         let latency_ns = now_ns.saturating_sub(asked.at_ns);
         match answer.result {
             Ok(effects) => {
                 self.shared.replicas.answered(&asked.host, latency_ns);
-                self.conclude(&id, running, Ok(Stepped { effects, by: asked.host, step_ns: latency_ns }));
+                self.conclude(
+                    &id,
+                    running,
+                    Ok(Stepped {
+                        effects,
+                        by: asked.host,
+                        step_ns: latency_ns,
+                    }),
+                );
             }
             Err(fault) => {
                 // A host that is not ready is no worse for it, only of no use now; a fault is the component's.
                 self.shared.replicas.answered(&asked.host, latency_ns);
-                running.events.push(CycleEvent::Faulted { replica: asked.host, fault: fault.to_string() });
+                running.events.push(CycleEvent::Faulted {
+                    replica: asked.host,
+                    fault: fault.to_string(),
+                });
                 if !matches!(fault, Fault::NotReady { .. }) {
                     running.fault = Some(fault);
                 }
@@ -415,37 +493,71 @@ impl Worker {
 
     /// A step for another host.
     pub(crate) fn step_request(&mut self, request: StepRequest) {
-        let StepRequest { from, correlation, loop_id, digest, limit_ns, frame, state } = request;
+        let StepRequest {
+            from,
+            correlation,
+            loop_id,
+            digest,
+            limit_ns,
+            frame,
+            state,
+        } = request;
         let began_ns = self.shared.now_ns();
         let here = self.shared.here.clone();
-        let not_ready = |reason: &str| Fault::NotReady { host: here.to_string(), reason: reason.to_owned() };
-        let held = self.seats.get_mut(&loop_id).and_then(|s| s.held.iter_mut().find(|h| h.spec.digest == digest));
+        let not_ready = |reason: &str| Fault::NotReady {
+            host: here.to_string(),
+            reason: reason.to_owned(),
+        };
+        let held = self
+            .seats
+            .get_mut(&loop_id)
+            .and_then(|s| s.held.iter_mut().find(|h| h.spec.digest == digest));
         let result = match held {
             Some(held) => held.instance.step(&frame, &state, limit_ns),
             None if crate::calls::is_call(&loop_id) => self.step_for_call(&digest, &frame, &state, limit_ns),
             None => Err(not_ready("the loop is not held here")),
         };
         let step_ns = self.shared.now_ns() - began_ns;
-        let answer = StepAnswer { from: self.shared.here.clone(), correlation, loop_id, result, step_ns };
+        let answer = StepAnswer {
+            from: self.shared.here.clone(),
+            correlation,
+            loop_id,
+            result,
+            step_ns,
+        };
         self.shared.wire.send_step_answer(&from, &answer);
     }
 
     /// No good step. In probation, the old component gets this very cycle; else the loop's policy decides.
     fn without_a_step(&mut self, id: &LoopId, mut running: Running, fault: Fault) {
-        let back = running.base.as_ref().and_then(|r| r.probation).map(|(revision, _)| revision);
+        let back = running
+            .base
+            .as_ref()
+            .and_then(|r| r.probation)
+            .map(|(revision, _)| revision);
         let Some(seat) = self.seats.get_mut(id) else { return };
         let places = back.and_then(|back| {
-            let new = seat.held.iter().position(|h| h.spec.revision == running.sample.revision)?;
+            let new = seat
+                .held
+                .iter()
+                .position(|h| h.spec.revision == running.sample.revision)?;
             let old = seat.held.iter().position(|h| h.spec.revision == back)?;
             Some((new, old))
         });
-        let Some((new, old)) = places else { return self.conclude(id, running, Err(fault)) };
-        let readings = seat.held[new].wiring.remap(&running.frame.readings, &seat.held[old].wiring);
+        let Some((new, old)) = places else {
+            return self.conclude(id, running, Err(fault));
+        };
+        let readings = seat.held[new]
+            .wiring
+            .remap(&running.frame.readings, &seat.held[old].wiring);
         let from = origin(&seat.held[new]);
         let held = &mut seat.held[old];
         let limit_ns = held.spec.step_limit_ns();
         let actuators = track(held, &readings);
-        let frame = Frame { readings: readings.clone(), ..running.frame.clone() };
+        let frame = Frame {
+            readings: readings.clone(),
+            ..running.frame.clone()
+        };
         let began_ns = self.shared.now_ns();
         let step = match held.wiring.bad_input(&readings) {
             Some(port) => Err(missing_input(held, port)),
@@ -455,7 +567,10 @@ impl Worker {
             }),
         };
         let step_ns = self.shared.now_ns() - began_ns;
-        running.events.push(CycleEvent::RolledBack { from: running.sample.revision, reason: fault.to_string() });
+        running.events.push(CycleEvent::RolledBack {
+            from: running.sample.revision,
+            reason: fault.to_string(),
+        });
         let by = self.shared.here.clone();
         let step = step.map(|effects| Stepped { effects, by, step_ns });
         self.conclude_with(id, running, step, old, readings, None);
@@ -464,7 +579,13 @@ impl Worker {
     /// A change of revision: both components step on the same frame here, and the bump decides.
     fn revise(&mut self, id: &LoopId, mut running: Running, command: bumpless_core::CommandId, revision: u64) {
         let Some(seat) = self.seats.get_mut(id) else { return };
-        let Some(old_index) = seat.held.iter().position(|h| h.spec.revision == running.sample.revision) else { return };
+        let Some(old_index) = seat
+            .held
+            .iter()
+            .position(|h| h.spec.revision == running.sample.revision)
+        else {
+            return;
+        };
         let began_ns = self.shared.now_ns();
         // The old component first: whatever the new one does, this cycle has an answer.
         let old = &mut seat.held[old_index];
@@ -475,7 +596,10 @@ impl Worker {
                 try_revision(seat, old_index, new_index, &running, old_step.as_ref().ok())
             }
             Some(_) => Err(format!("revision {revision} is in force already")),
-            None => Err(format!("revision {revision} is not prepared on {}, the loop's owner", self.shared.here)),
+            None => Err(format!(
+                "revision {revision} is not prepared on {}, the loop's owner",
+                self.shared.here
+            )),
         };
         let step_ns = self.shared.now_ns() - began_ns;
         let by = self.shared.here.clone();
@@ -495,7 +619,11 @@ impl Worker {
                     running.standing.manual = track(&seat.held[tried.index], &tried.readings);
                 }
                 running.state = tried.state;
-                let step = Ok(Stepped { effects: tried.effects, by, step_ns });
+                let step = Ok(Stepped {
+                    effects: tried.effects,
+                    by,
+                    step_ns,
+                });
                 self.conclude_with(id, running, step, tried.index, tried.readings, probation);
             }
             Err(reason) => {
@@ -511,7 +639,13 @@ impl Worker {
     /// Ends the cycle under the revision in force.
     fn conclude(&mut self, id: &LoopId, running: Running, step: Result<Stepped, Fault>) {
         let Some(seat) = self.seats.get(id) else { return };
-        let Some(index) = seat.held.iter().position(|h| h.spec.revision == running.sample.revision) else { return };
+        let Some(index) = seat
+            .held
+            .iter()
+            .position(|h| h.spec.revision == running.sample.revision)
+        else {
+            return;
+        };
         let readings = running.frame.readings.clone();
         let probation = swap::probation_after(running.base.as_deref());
         self.conclude_with(id, running, step, index, readings, probation);
@@ -555,7 +689,9 @@ impl Worker {
         } else {
             let record = Arc::new(record);
             seat.inflight = Some(Arc::clone(&record));
-            self.shared.wire.send_answer(&home, &Answer::Commit(Box::new(Arc::unwrap_or_clone(record))));
+            self.shared
+                .wire
+                .send_answer(&home, &Answer::Commit(Box::new(Arc::unwrap_or_clone(record))));
         }
     }
 }
@@ -615,12 +751,21 @@ fn try_revision(
             .map(|(state, by)| (Arc::from(state), by))
             .map_err(|fault| format!("no state could be made for the new component: {fault}"))?,
     };
-    let frame = Frame { readings: readings.clone(), ..running.frame.clone() };
-    let effects = new.instance.step(&frame, &state, limit_ns).map_err(|fault| format!("its first step failed: {fault}"))?;
+    let frame = Frame {
+        readings: readings.clone(),
+        ..running.frame.clone()
+    };
+    let effects = new
+        .instance
+        .step(&frame, &state, limit_ns)
+        .map_err(|fault| format!("its first step failed: {fault}"))?;
     let wanted = new.wiring.wanted(&effects.writes, &actuators);
-    let manual = if running.standing.manual.len() == actuators.len() { &running.standing.manual } else { &actuators };
-    let new_outputs =
-        bumpless_core::guard::guard(mode, &wanted, manual, &actuators, &new.wiring.limits, dt_ns).outputs;
+    let manual = if running.standing.manual.len() == actuators.len() {
+        &running.standing.manual
+    } else {
+        &actuators
+    };
+    let new_outputs = bumpless_core::guard::guard(mode, &wanted, manual, &actuators, &new.wiring.limits, dt_ns).outputs;
     let spans: Vec<f64> = (0..new_outputs.len()).map(|i| new.wiring.span(i)).collect();
     // Outputs that the old component did not drive are compared with what their actuators hold.
     let same_ports = old_outputs.len() == new_outputs.len();
@@ -633,6 +778,12 @@ fn try_revision(
              the loop allows {limit} % (policy.bump_limit_percent)"
         ));
     }
-    Ok(Tried { index: new_index, readings, state, effects, by, bump_percent })
+    Ok(Tried {
+        index: new_index,
+        readings,
+        state,
+        effects,
+        by,
+        bump_percent,
+    })
 }
-

@@ -10,7 +10,11 @@ use bumpless_engine::{Engine, Instance};
 use bumpless_io::{Clock, IoServer};
 use crossbeam_channel::Sender;
 
-use crate::{event::{Event, LoopsEvent}, replicas::Replicas, wire::Wire};
+use crate::{
+    event::{Event, LoopsEvent},
+    replicas::Replicas,
+    wire::Wire,
+};
 
 /// Where reports to deployment go; must not block.
 pub(crate) type Sink = Arc<dyn Fn(LoopsEvent) + Send + Sync>;
@@ -44,7 +48,14 @@ impl Shared {
 
     /// Tells every worker but `from` of a record whose messages may be for a home of theirs. A full inbox loses them.
     pub(crate) fn spread(&self, from: usize, record: &Arc<Record>) {
-        for (_, inbox) in self.inboxes.get().into_iter().flatten().enumerate().filter(|(i, _)| *i != from) {
+        for (_, inbox) in self
+            .inboxes
+            .get()
+            .into_iter()
+            .flatten()
+            .enumerate()
+            .filter(|(i, _)| *i != from)
+        {
             if inbox.try_send(Event::Record(Arc::clone(record))).is_err() {
                 self.dropped.fetch_add(1, Ordering::Relaxed);
             }

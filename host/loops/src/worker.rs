@@ -68,7 +68,10 @@ impl Worker {
         }
         loop {
             let now_ns = self.fire();
-            let next_ns = self.timers.peek().map_or(now_ns + NAP_NS_MAX, |Reverse((at_ns, _))| *at_ns);
+            let next_ns = self
+                .timers
+                .peek()
+                .map_or(now_ns + NAP_NS_MAX, |Reverse((at_ns, _))| *at_ns);
             let wait = Duration::from_nanos(next_ns.saturating_sub(now_ns).min(NAP_NS_MAX));
             match self.inbox.recv_timeout(wait) {
                 Ok(Event::Stop) | Err(RecvTimeoutError::Disconnected) => break,
@@ -106,7 +109,9 @@ impl Worker {
                 Some(Reverse((at_ns, _))) if *at_ns <= now_ns => {}
                 _ => return now_ns,
             }
-            let Some(Reverse((at_ns, timer))) = self.timers.pop() else { return now_ns };
+            let Some(Reverse((at_ns, timer))) = self.timers.pop() else {
+                return now_ns;
+            };
             match timer {
                 Timer::Home(id) => self.home_due(&id, at_ns, now_ns),
                 Timer::Seat(id) => self.seat_due(&id, at_ns, now_ns),
@@ -132,7 +137,7 @@ impl Worker {
             Event::StepAnswer(answer) => self.step_answer(*answer),
             Event::Ping { from, token } => self.shared.wire.pong(&from, token),
             Event::HostGone(host) => self.host_gone(&host),
-            Event::OpenHome(home) => self.open_home(home.0, home.1, home.2),
+            Event::OpenHome(opening) => self.open_home(*opening),
             Event::AddHomeRevision(revision) => self.add_home_revision(*revision),
             Event::CloseHome(id) => self.close_home(&id),
             Event::Members(id, members) => self.members(&id, members),
@@ -154,16 +159,27 @@ impl Worker {
     /// A host is gone: homes look for another owner at once, seats and calls for another replica.
     fn host_gone(&mut self, host: &bumpless_core::HostId) {
         let now_ns = self.shared.now_ns();
-        let homes: Vec<LoopId> =
-            self.homes.iter().filter(|(_, h)| h.desk.members().contains(host)).map(|(id, _)| id.clone()).collect();
+        let homes: Vec<LoopId> = self
+            .homes
+            .iter()
+            .filter(|(_, h)| h.desk.members().contains(host))
+            .map(|(id, _)| id.clone())
+            .collect();
         for id in homes {
-            let members = self.homes.get(&id).map(|h| h.desk.members().iter().filter(|m| *m != host).cloned().collect());
+            let members = self
+                .homes
+                .get(&id)
+                .map(|h| h.desk.members().iter().filter(|m| *m != host).cloned().collect());
             if let Some(members) = members {
                 self.members(&id, members);
             }
         }
-        let waiting: Vec<LoopId> =
-            self.seats.iter().filter(|(_, s)| s.waits_for(host)).map(|(id, _)| id.clone()).collect();
+        let waiting: Vec<LoopId> = self
+            .seats
+            .iter()
+            .filter(|(_, s)| s.waits_for(host))
+            .map(|(id, _)| id.clone())
+            .collect();
         for id in waiting {
             self.replica_lost(&id, host, now_ns);
         }

@@ -10,8 +10,8 @@ use std::{
 
 use bumpless_cell::{Arrival, Roles, Vitals};
 use bumpless_core::{
-    Command, CommandBody, CommandId, Digest, Event, HostId, LoopId, LoopSpec, Mode, OutputLimit, Outcome, PointId, Policy,
-    Record, Strategy, Wiring,
+    Command, CommandBody, CommandId, Digest, Event, HostId, LoopId, LoopSpec, Mode, Outcome, OutputLimit, PointId,
+    Policy, Record, Strategy, Wiring,
     protocol::{Answer, Sample, StepAnswer, StepRequest},
 };
 use bumpless_engine::Engine;
@@ -61,7 +61,13 @@ impl Wire for Port {
         self.send(to, Arrival::Sample(Box::new(sample.clone())));
     }
     fn send_answer(&self, to: &HostId, answer: &Answer) {
-        self.send(to, Arrival::Answer { from: self.here.clone(), answer: Box::new(answer.clone()) });
+        self.send(
+            to,
+            Arrival::Answer {
+                from: self.here.clone(),
+                answer: Box::new(answer.clone()),
+            },
+        );
     }
     fn send_step(&self, to: &HostId, request: &StepRequest) {
         self.send(to, Arrival::StepRequest(Box::new(request.clone())));
@@ -70,18 +76,37 @@ impl Wire for Port {
         self.send(to, Arrival::StepAnswer(Box::new(answer.clone())));
     }
     fn publish_record(&self, record: &Record) {
-        let others: Vec<HostId> =
-            self.board.hosts.lock().unwrap().keys().filter(|h| **h != self.here).cloned().collect();
+        let others: Vec<HostId> = self
+            .board
+            .hosts
+            .lock()
+            .unwrap()
+            .keys()
+            .filter(|h| **h != self.here)
+            .cloned()
+            .collect();
         let record = Arc::new(record.clone());
         for other in others {
             self.send(&other, Arrival::Record(Arc::clone(&record)));
         }
     }
     fn ping(&self, to: &HostId, token: u64) {
-        self.send(to, Arrival::Ping { from: self.here.clone(), token });
+        self.send(
+            to,
+            Arrival::Ping {
+                from: self.here.clone(),
+                token,
+            },
+        );
     }
     fn pong(&self, to: &HostId, token: u64) {
-        self.send(to, Arrival::Pong { from: self.here.clone(), token });
+        self.send(
+            to,
+            Arrival::Pong {
+                from: self.here.clone(),
+                token,
+            },
+        );
     }
 }
 
@@ -103,14 +128,20 @@ fn component(name: &str) -> Vec<u8> {
 impl Bench {
     /// A plant host with one first-order process, and holders (the plant host itself where its name is among them).
     fn new(holders: &[&str], spec: impl FnOnce(&mut LoopSpec)) -> Self {
-        let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build().unwrap();
+        let runtime = tokio::runtime::Builder::new_multi_thread()
+            .worker_threads(1)
+            .enable_all()
+            .build()
+            .unwrap();
         let sim: SimConfig = serde_json::from_value(serde_json::json!({
             "id": "plant", "seed": 1,
             "fopdt": { "count": 1, "gain": 1.0, "tau_s": 0.5, "dead_time_s": 0.02, "noise": 0.0 },
         }))
         .unwrap();
         let clock = Clock::start();
-        let io = bumpless_io::Config { buses: vec![BusConfig::Sim(sim)] };
+        let io = bumpless_io::Config {
+            buses: vec![BusConfig::Sim(sim)],
+        };
         let io = Arc::new(IoServer::open(&io, clock, runtime.handle()).unwrap());
         let engine = Engine::new(bumpless_engine::Config::default()).unwrap();
         let (board, home) = (Arc::new(Switchboard::default()), host("plant"));
@@ -120,7 +151,10 @@ impl Bench {
         names.extend(holders.iter().filter(|h| **h != home).cloned());
         for name in names {
             let io = (name == home).then(|| Arc::clone(&io));
-            let port = Arc::new(Port { here: name.clone(), board: Arc::clone(&board) });
+            let port = Arc::new(Port {
+                here: name.clone(),
+                board: Arc::clone(&board),
+            });
             let sender = sender.clone();
             let sink = Arc::new(move |event| {
                 if let LoopsEvent::Record(record) = event {
@@ -131,14 +165,31 @@ impl Bench {
             let loops = Loops::start(&config, name.clone(), clock, io, engine.clone(), port, sink).unwrap();
             board.hosts.lock().unwrap().insert(name, loops);
         }
-        let bench =
-            Self { board, engine, home, holders, records, seen: Vec::new(), commands: 0, _runtime: runtime };
+        let bench = Self {
+            board,
+            engine,
+            home,
+            holders,
+            records,
+            seen: Vec::new(),
+            commands: 0,
+            _runtime: runtime,
+        };
         let mut first = bench.spec("pid", 1, &[("k", 2.0), ("ti", 0.5)]);
         spec(&mut first);
         bench.hold(&first);
         bench.tell_of_hosts(&[first.digest]);
         let wiring = bench.wiring(&first);
-        bench.at(&bench.home).open_home(HomeRevision { spec: Arc::new(first), wiring }, None).unwrap();
+        bench
+            .at(&bench.home)
+            .open_home(
+                HomeRevision {
+                    spec: Arc::new(first),
+                    wiring,
+                },
+                None,
+            )
+            .unwrap();
         bench.set_members(&bench.holders.clone());
         bench
     }
@@ -167,9 +218,21 @@ impl Bench {
             mode: Mode::Automatic,
             strategy: Strategy::RoundRobin,
             replicas: 3,
-            limits: [("out".to_owned(), OutputLimit { low: 0.0, high: 100.0, rate_per_s: None, safe: 0.0 })].into(),
+            limits: [(
+                "out".to_owned(),
+                OutputLimit {
+                    low: 0.0,
+                    high: 100.0,
+                    rate_per_s: None,
+                    safe: 0.0,
+                },
+            )]
+            .into(),
             listens: vec![],
-            policy: Policy { probation_cycles: 30, ..Policy::default() },
+            policy: Policy {
+                probation_cycles: 30,
+                ..Policy::default()
+            },
         }
     }
 
@@ -198,7 +261,10 @@ impl Bench {
                     host: of.clone(),
                     seq: 1,
                     started_at_ms: 0,
-                    roles: Roles { io: false, control: true },
+                    roles: Roles {
+                        io: false,
+                        control: true,
+                    },
                     api: None,
                     cpu: 0.1,
                     cpu_process: 0.1,
@@ -241,7 +307,10 @@ impl Bench {
     fn command(&mut self, body: CommandBody) -> (Outcome, Arc<Record>) {
         self.commands += 1;
         let (sender, reply) = crossbeam_channel::bounded(1);
-        let command = Command { id: CommandId(self.commands), body };
+        let command = Command {
+            id: CommandId(self.commands),
+            body,
+        };
         let done = Box::new(move |reply| drop(sender.send(reply)));
         self.at(&self.home).command(&loop_id(), command, done).unwrap();
         match reply.recv_timeout(PATIENCE).unwrap() {
@@ -254,13 +323,18 @@ impl Bench {
     fn revise(&mut self, spec: &LoopSpec) -> (Outcome, Arc<Record>) {
         self.hold(spec);
         self.tell_of_hosts(&[self.digest("pid"), spec.digest]);
-        let revision = HomeRevision { spec: Arc::new(spec.clone()), wiring: self.wiring(spec) };
+        let revision = HomeRevision {
+            spec: Arc::new(spec.clone()),
+            wiring: self.wiring(spec),
+        };
         self.at(&self.home).add_home_revision(revision).unwrap();
         self.command(CommandBody::Revise(spec.revision))
     }
 
     fn settled(&mut self) {
-        self.until("the loop settles", |r| (r.readings[0].value_or_last() - r.setpoint).abs() < 0.5);
+        self.until("the loop settles", |r| {
+            (r.readings[0].value_or_last() - r.setpoint).abs() < 0.5
+        });
     }
 }
 
@@ -282,7 +356,9 @@ fn replicas_take_turns_and_a_silent_one_costs_no_cycle() {
     let silent = bench.holders.iter().find(|h| **h != owner).unwrap().clone();
     bench.board.cut.lock().unwrap().insert(silent.clone());
     let hedged = bench.until("a silent replica is passed over", |r| {
-        r.events.contains(&Event::Hedged { replica: silent.clone() })
+        r.events.contains(&Event::Hedged {
+            replica: silent.clone(),
+        })
     });
     assert_ne!(hedged.stepped_by, silent);
     for _ in 0..20 {
@@ -301,7 +377,9 @@ fn a_silent_owner_is_replaced_and_fenced_and_a_dead_one_too() {
     bench.board.cut.lock().unwrap().insert(first.owner.clone());
     let second = bench.until("a takeover", |r| r.owner != first.owner);
     assert!(second.term > first.term);
-    assert!(second.events.contains(&Event::TookOver { from: Some(first.owner.clone()) }));
+    assert!(second.events.contains(&Event::TookOver {
+        from: Some(first.owner.clone())
+    }));
     // It comes back; nothing that it sends counts, and it learns of its successor.
     bench.board.cut.lock().unwrap().clear();
     for _ in 0..20 {
@@ -332,9 +410,15 @@ fn commands_take_effect_with_a_record() {
     assert_eq!(record.mode, Mode::Manual);
     let (outcome, record) = bench.command(CommandBody::Output(vec![33.0]));
     assert_eq!((outcome, &record.outputs), (Outcome::Done, &vec![33.0]));
-    let held = bench.until("the actuator holds it", |r| r.outputs[0] == 33.0 && (r.readings[4].value_or_last() - 33.0).abs() < 0.01);
+    let held = bench.until("the actuator holds it", |r| {
+        r.outputs[0] == 33.0 && (r.readings[4].value_or_last() - 33.0).abs() < 0.01
+    });
     let (_, record) = bench.command(CommandBody::Mode(Mode::Automatic));
-    assert!((record.outputs[0] - held.outputs[0]).abs() < 0.01, "back to automatic without a bump: {}", record.outputs[0]);
+    assert!(
+        (record.outputs[0] - held.outputs[0]).abs() < 0.01,
+        "back to automatic without a bump: {}",
+        record.outputs[0]
+    );
 }
 
 #[test]
@@ -344,7 +428,8 @@ fn a_swap_goes_without_a_bump_and_the_takeover_after_it_knows() {
     let tuning = [("k", 2.0), ("ti", 0.5)];
     let (outcome, record) = bench.revise(&bench.spec("pidplus", 2, &tuning));
     assert_eq!((outcome, record.revision), (Outcome::Done, 2));
-    let Some(Event::Revised { bump_percent, .. }) = record.events.iter().find(|e| matches!(e, Event::Revised { .. })) else {
+    let Some(Event::Revised { bump_percent, .. }) = record.events.iter().find(|e| matches!(e, Event::Revised { .. }))
+    else {
         panic!("{:?}", record.events)
     };
     assert!(*bump_percent < 0.1, "{bump_percent}");
@@ -363,13 +448,24 @@ fn a_swap_that_bumps_or_fails_at_once_is_refused() {
         ("guests/traps", vec![], "first step failed"),
         ("guests/returns-nan", vec![], "first step failed"),
         ("guests/spins", vec![], "limit"),
-        ("guests/jumps", vec![("by", 30.0)], "beyond what the old controller does"),
+        (
+            "guests/jumps",
+            vec![("by", 30.0)],
+            "beyond what the old controller does",
+        ),
     ] {
         let mut spec = bench.spec(component, 2, &parameters);
         spec.policy.bump_limit_percent = 2.0;
         let (outcome, record) = bench.revise(&spec);
-        assert!(matches!(&outcome, Outcome::Refused(why) if why.contains(part)), "{component}: {outcome:?}");
-        assert_eq!((record.revision, record.faults_in_row), (1, 0), "{component}: the old one has the cycle");
+        assert!(
+            matches!(&outcome, Outcome::Refused(why) if why.contains(part)),
+            "{component}: {outcome:?}"
+        );
+        assert_eq!(
+            (record.revision, record.faults_in_row),
+            (1, 0),
+            "{component}: the old one has the cycle"
+        );
     }
 }
 
@@ -380,9 +476,18 @@ fn a_fault_on_probation_rolls_back_in_the_same_cycle() {
     for (revision, component) in [(2, "guests/traps"), (3, "guests/spins"), (4, "guests/returns-nan")] {
         let (outcome, _) = bench.revise(&bench.spec(component, revision, &[("after", 5.0)]));
         assert_eq!(outcome, Outcome::Done, "{component}");
-        let back = bench.until("a rollback", |r| r.events.iter().any(|e| matches!(e, Event::RolledBack { .. })));
-        assert_eq!((back.revision, back.probation, back.faults_in_row), (1, None, 0), "{component}");
-        assert!(!back.events.contains(&Event::PolicyHeld), "{component}: the old one has this very cycle");
+        let back = bench.until("a rollback", |r| {
+            r.events.iter().any(|e| matches!(e, Event::RolledBack { .. }))
+        });
+        assert_eq!(
+            (back.revision, back.probation, back.faults_in_row),
+            (1, None, 0),
+            "{component}"
+        );
+        assert!(
+            !back.events.contains(&Event::PolicyHeld),
+            "{component}: the old one has this very cycle"
+        );
         assert_eq!(bench.next().revision, 1);
     }
 }
@@ -393,19 +498,48 @@ fn calls_are_stepped_where_the_strategy_says_and_only_where_the_component_is_rea
     let digest = bench.digest("pid");
     let prepared = bench.engine.prepared(&digest).unwrap();
     let defaults: Vec<f64> = prepared.descriptor().parameters.iter().map(|p| p.default).collect();
-    let state: Arc<[u8]> = prepared.instantiate().unwrap().start(&defaults, &[20.0], 10_000_000).unwrap().into();
+    let state: Arc<[u8]> = prepared
+        .instantiate()
+        .unwrap()
+        .start(&defaults, &[20.0], 10_000_000)
+        .unwrap()
+        .into();
     let ports = prepared.descriptor().ports.len();
     let call = |digest, seq| {
         let readings = (0..ports).map(|_| bumpless_core::Reading::good(20.0, 1)).collect();
-        let cycle =
-            bumpless_core::Cycle { seq, at_ns: 2, dt_ns: 100_000_000, mode: Mode::Automatic, setpoint: 20.0 };
+        let cycle = bumpless_core::Cycle {
+            seq,
+            at_ns: 2,
+            dt_ns: 100_000_000,
+            mode: Mode::Automatic,
+            setpoint: 20.0,
+        };
         let (sender, reply) = crossbeam_channel::bounded(1);
-        let frame = bumpless_core::Frame { cycle, readings, messages: vec![] };
+        let frame = bumpless_core::Frame {
+            cycle,
+            readings,
+            messages: vec![],
+        };
         let done = Box::new(move |reply| drop(sender.send(reply)));
-        bench.at(&host("a")).call(digest, Strategy::RoundRobin, frame, Arc::clone(&state), 10_000_000, done).unwrap();
+        bench
+            .at(&host("a"))
+            .call(
+                digest,
+                Strategy::RoundRobin,
+                frame,
+                Arc::clone(&state),
+                10_000_000,
+                done,
+            )
+            .unwrap();
         reply.recv_timeout(PATIENCE).unwrap()
     };
     let by: HashSet<HostId> = (0..3).map(|seq| call(digest, seq).unwrap().answer.from).collect();
     assert_eq!(by.len(), 3);
-    assert!(call(Digest::of(b"nothing"), 0).unwrap_err().to_string().contains("not compiled here"));
+    assert!(
+        call(Digest::of(b"nothing"), 0)
+            .unwrap_err()
+            .to_string()
+            .contains("not compiled here")
+    );
 }

@@ -50,7 +50,14 @@ fn commit(sample: &Sample) -> Record {
     record.after = sample.last;
     record.owner = sample.owner.clone();
     record.at_ns = sample.at_ns;
-    record.applied = sample.commands.iter().map(|c| Applied { id: c.id, outcome: Outcome::Done }).collect();
+    record.applied = sample
+        .commands
+        .iter()
+        .map(|c| Applied {
+            id: c.id,
+            outcome: Outcome::Done,
+        })
+        .collect();
     record
 }
 
@@ -74,16 +81,40 @@ fn a_silent_owner_is_replaced_within_the_period_and_fenced() {
     desk.check(&commit(&first)).unwrap();
     desk.take(first.at_ns + 1, commit(&first));
     let second = next(&mut desk);
-    assert_eq!(desk.overdue(second.at_ns + 49), None, "half of the period is the owner's");
+    assert_eq!(
+        desk.overdue(second.at_ns + 49),
+        None,
+        "half of the period is the owner's"
+    );
     let again = sent(desk.overdue(second.at_ns + 50));
-    assert_eq!((again.owner.clone(), again.seq, again.at_ns), (host(1), second.seq, second.at_ns));
+    assert_eq!(
+        (again.owner.clone(), again.seq, again.at_ns),
+        (host(1), second.seq, second.at_ns)
+    );
     assert!(again.term > second.term);
-    assert_eq!(again.resume.as_ref().map(|r| r.position()), Some(second.last), "the new owner gets the last record");
-    assert_eq!(desk.check(&commit(&second)), Err(Refusal::OldTerm), "the silent owner comes back too late");
+    assert_eq!(
+        again.resume.as_ref().map(|r| r.position()),
+        Some(second.last),
+        "the new owner gets the last record"
+    );
+    assert_eq!(
+        desk.check(&commit(&second)),
+        Err(Refusal::OldTerm),
+        "the silent owner comes back too late"
+    );
     desk.check(&commit(&again)).unwrap();
     desk.take(again.at_ns + 60, commit(&again));
     assert_eq!(next(&mut desk).owner, host(1), "the ownership stays where it works");
-    assert_eq!(desk.tally(), Tally { taken: 2, lost: 0, skipped: 0, takeovers: 1, refused: 1 });
+    assert_eq!(
+        desk.tally(),
+        Tally {
+            taken: 2,
+            lost: 0,
+            skipped: 0,
+            takeovers: 1,
+            refused: 1
+        }
+    );
 }
 
 #[test]
@@ -130,7 +161,10 @@ fn a_planned_move_loses_nothing() {
 #[test]
 fn commands_ride_until_a_record_holds_them_and_a_full_queue_refuses() {
     let mut desk = desk();
-    let command = |n: u128| Command { id: CommandId(n), body: CommandBody::Setpoint(2.0) };
+    let command = |n: u128| Command {
+        id: CommandId(n),
+        body: CommandBody::Setpoint(2.0),
+    };
     for n in 0..COMMANDS_WAITING_MAX as u128 {
         assert_eq!(desk.command(command(n)), Queued::Waits);
     }
@@ -144,7 +178,13 @@ fn commands_ride_until_a_record_holds_them_and_a_full_queue_refuses() {
     assert_eq!(again.commands, first.commands, "the next owner gets them too");
     desk.check(&commit(&again)).unwrap();
     desk.take(again.at_ns + 60, commit(&again));
-    assert_eq!(desk.command(command(0)), Queued::Ended(Applied { id: CommandId(0), outcome: Outcome::Done }));
+    assert_eq!(
+        desk.command(command(0)),
+        Queued::Ended(Applied {
+            id: CommandId(0),
+            outcome: Outcome::Done
+        })
+    );
     assert!(next(&mut desk).commands.is_empty());
 }
 

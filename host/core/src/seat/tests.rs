@@ -35,7 +35,12 @@ fn setup() -> (LoopSpec, Wiring) {
         parameters: vec![],
         state_layout: 1,
     };
-    let limit = OutputLimit { low: 0.0, high: 100.0, rate_per_s: None, safe: 10.0 };
+    let limit = OutputLimit {
+        low: 0.0,
+        high: 100.0,
+        rate_per_s: None,
+        safe: 10.0,
+    };
     let spec = LoopSpec {
         id: LoopId::new("l").unwrap(),
         revision: 1,
@@ -75,7 +80,10 @@ fn sample(commands: Vec<CommandBody>) -> Sample {
         commands: commands
             .into_iter()
             .enumerate()
-            .map(|(n, body)| Command { id: CommandId(n as u128 + 1), body })
+            .map(|(n, body)| Command {
+                id: CommandId(n as u128 + 1),
+                body,
+            })
             .collect(),
         messages: vec![],
         last: (3, 11),
@@ -111,7 +119,15 @@ fn conclude_with(step: Result<Stepped, Fault>, standing: Standing, base: &Record
 }
 
 fn stepped(value: f64) -> Result<Stepped, Fault> {
-    Ok(Stepped { effects: Effects { state: vec![8], writes: vec![(1, value)], ..Effects::default() }, by: host(1), step_ns: 3 })
+    Ok(Stepped {
+        effects: Effects {
+            state: vec![8],
+            writes: vec![(1, value)],
+            ..Effects::default()
+        },
+        by: host(1),
+        step_ns: 3,
+    })
 }
 
 #[test]
@@ -142,7 +158,10 @@ fn commands_take_effect_in_order_or_say_why_not() {
         CommandBody::Revise(3),
     ]);
     let standing = settle(Some(&before()), &spec, &s, &[42.0]);
-    assert_eq!((standing.mode, standing.setpoint, &standing.manual), (Mode::Manual, 5.0, &vec![33.0]));
+    assert_eq!(
+        (standing.mode, standing.setpoint, &standing.manual),
+        (Mode::Manual, 5.0, &vec![33.0])
+    );
     let refused: Vec<(u128, &str)> = standing
         .applied
         .iter()
@@ -151,22 +170,40 @@ fn commands_take_effect_in_order_or_say_why_not() {
             Outcome::Done => None,
         })
         .collect();
-    let wanted = [(1, "put it in manual"), (3, "0 to 10"), (6, "2 output values"), (7, "not a finite"), (8, "0 to 10")];
+    let wanted = [
+        (1, "put it in manual"),
+        (3, "0 to 10"),
+        (6, "2 output values"),
+        (7, "not a finite"),
+        (8, "0 to 10"),
+    ];
     assert_eq!(refused.len(), wanted.len());
     for ((id, why), (wanted_id, part)) in refused.iter().zip(wanted) {
         assert!(*id == wanted_id && why.contains(part), "{id}: {why}");
     }
-    assert_eq!(standing.revise, Some((CommandId(9), 2)), "one change of revision at a time");
+    assert_eq!(
+        standing.revise,
+        Some((CommandId(9), 2)),
+        "one change of revision at a time"
+    );
     assert!(!standing.applied.iter().any(|a| a.id.0 >= 9), "their outcome is open");
 }
 
 #[test]
 fn manual_begins_with_what_the_actuator_holds() {
     let (spec, _) = setup();
-    let standing = settle(Some(&before()), &spec, &sample(vec![CommandBody::Mode(Mode::Manual)]), &[42.0]);
+    let standing = settle(
+        Some(&before()),
+        &spec,
+        &sample(vec![CommandBody::Mode(Mode::Manual)]),
+        &[42.0],
+    );
     assert_eq!(standing.manual, vec![42.0]);
     let record = conclude_with(stepped(90.0), standing, &before(), &spec);
-    assert_eq!((record.outputs, record.wanted, record.mode), (vec![42.0], vec![90.0], Mode::Manual));
+    assert_eq!(
+        (record.outputs, record.wanted, record.mode),
+        (vec![42.0], vec![90.0], Mode::Manual)
+    );
 }
 
 #[test]
@@ -174,10 +211,19 @@ fn a_good_step_is_guarded_and_recorded() {
     let (spec, _) = setup();
     let standing = settle(Some(&before()), &spec, &sample(vec![]), &[42.0]);
     let record = conclude_with(stepped(140.0), standing, &before(), &spec);
-    assert_eq!((record.outputs.clone(), record.wanted.clone()), (vec![100.0], vec![140.0]));
+    assert_eq!(
+        (record.outputs.clone(), record.wanted.clone()),
+        (vec![100.0], vec![140.0])
+    );
     assert_eq!(record.events, vec![Event::Limited(1)]);
-    assert_eq!((record.position(), record.after, record.dt_ns), ((3, 12), (3, 11), 100_000_000));
-    assert_eq!((&*record.state, record.stepped_by, record.faults_in_row), (&[8][..], host(1), 0));
+    assert_eq!(
+        (record.position(), record.after, record.dt_ns),
+        ((3, 12), (3, 11), 100_000_000)
+    );
+    assert_eq!(
+        (&*record.state, record.stepped_by, record.faults_in_row),
+        (&[8][..], host(1), 0)
+    );
 }
 
 #[test]
@@ -193,12 +239,20 @@ fn faults_hold_then_the_policy_acts() {
         let fault = || Err(Fault::Overrun { limit_us: 5 });
         let standing = || settle(Some(&before()), &spec, &sample(vec![]), &[42.0]);
         let first = conclude_with(fault(), standing(), &before(), &spec);
-        assert_eq!((first.outputs.clone(), first.faults_in_row), (vec![42.0], 1), "the first one only holds");
+        assert_eq!(
+            (first.outputs.clone(), first.faults_in_row),
+            (vec![42.0], 1),
+            "the first one only holds"
+        );
         assert_eq!(&*first.state, &[7], "the state stays");
         let mut base = before();
         base.faults_in_row = 1;
         let second = conclude_with(fault(), standing(), &base, &spec);
-        assert_eq!((second.outputs, second.mode, second.faults_in_row), (vec![outputs], mode, 2), "{on_fault:?}");
+        assert_eq!(
+            (second.outputs, second.mode, second.faults_in_row),
+            (vec![outputs], mode, 2),
+            "{on_fault:?}"
+        );
     }
 }
 
