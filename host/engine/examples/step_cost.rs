@@ -4,7 +4,7 @@
 //! Only a release build's figures mean anything; compare figures of one run, for machines are noisy.
 #![allow(clippy::print_stdout, reason = "a program for people")]
 
-use std::{path::PathBuf, process::ExitCode, time::Instant};
+use std::{path::Path, process::ExitCode, time::Instant};
 
 use bumpless_core::{Cycle, Direction, Frame, Mode, Reading};
 use bumpless_engine::{Config, Engine};
@@ -19,7 +19,7 @@ fn main() -> ExitCode {
         return ExitCode::FAILURE;
     };
     let mut number = |default| args.next().and_then(|text| text.parse().ok()).unwrap_or(default);
-    match measure(path.into(), number(100_000), number(1000)) {
+    match measure(path.as_ref(), number(100_000), number(1000)) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             println!("{error}");
@@ -28,8 +28,8 @@ fn main() -> ExitCode {
     }
 }
 
-fn measure(path: PathBuf, steps: usize, instances: usize) -> Result<(), Box<dyn std::error::Error>> {
-    let bytes = std::fs::read(&path)?;
+fn measure(path: &Path, steps: usize, instances: usize) -> Result<(), Box<dyn std::error::Error>> {
+    let bytes = std::fs::read(path)?;
     let instances_max = u32::try_from(instances)?.max(2);
     let engine = Engine::new(Config {
         instances_max,

@@ -18,7 +18,7 @@ use std::{
     io::{self, Write as _},
     os::unix::fs::{DirBuilderExt as _, OpenOptionsExt as _, PermissionsExt as _},
     path::{Path, PathBuf},
-    time::SystemTime,
+    time::{Duration, SystemTime},
 };
 
 use bumpless_core::Digest;
@@ -30,6 +30,9 @@ use crate::{Error, Profile, compile::unique, error::brief};
 const MAGIC: &[u8; 8] = b"BLCODE01";
 const MAC_BYTES: usize = 32;
 const HEADER_BYTES: usize = MAGIC.len() + 32 + 32;
+
+/// Far longer than a compilation or a write takes: a hidden entry of that age belongs to nobody alive.
+const LEFT_BEHIND_AFTER: Duration = Duration::from_secs(3600);
 
 /// The folder of compiled code.
 pub(crate) struct Cache {
@@ -57,12 +60,14 @@ impl Cache {
         let mut hash = Fingerprint(Sha256::new());
         engine.precompile_compatibility_hash().hash(&mut hash);
         hash.write(profile.name().as_bytes());
-        Ok(Self {
+        let cache = Self {
             dir,
             key,
             engine: hash.0.finalize().into(),
             files_max,
-        })
+        };
+        cache.sweep();
+        Ok(cache)
     }
 
     /// The folder.
@@ -147,6 +152,32 @@ impl Cache {
                 tracing::warn!(path = %path.display(), %error, "compiled code cannot be removed");
             }
             _ => {}
+        }
+    }
+
+    /// Removes what a host that was killed left half done: a later one must not fill its disk with it.
+    fn sweep(&self) {
+        let Ok(entries) = fs::read_dir(&self.dir) else { return };
+        for entry in entries
+            .flatten()
+            .filter(|e| e.file_name().as_encoded_bytes().starts_with(b"."))
+        {
+            let age = entry
+                .metadata()
+                .and_then(|m| m.modified())
+                .ok()
+                .and_then(|t| t.elapsed().ok());
+            if age.is_some_and(|age| age > LEFT_BEHIND_AFTER) {
+                let path = entry.path();
+                let removed = if path.is_dir() {
+                    fs::remove_dir_all(&path)
+                } else {
+                    fs::remove_file(&path)
+                };
+                if let Err(error) = removed {
+                    tracing::warn!(path = %path.display(), %error, "what an earlier host left behind cannot be removed");
+                }
+            }
         }
     }
 

@@ -160,16 +160,37 @@ impl Engine {
         check_bytes(bytes, &self.0.core.limits)?;
         let digest = Digest::of(bytes);
         let core = &self.0.core;
-        if let Some(component) = self
-            .0
-            .cache
-            .as_ref()
-            .and_then(|cache| cache.load(&digest, &core.engine))
-        {
+        let limits = &core.limits;
+        let cached = || {
+            self.0
+                .cache
+                .as_ref()
+                .and_then(|cache| cache.load(&digest, &core.engine))
+        };
+        if let Some(component) = cached() {
+            return Ok((Prepared::new(Arc::clone(core), digest, &component)?, None));
+        }
+        // One whole compilation may be ahead of this one; more is a crowd.
+        let turn = self.0.compilations.enter(limits.compile_time_max * 2)?;
+        // It may have been this very component.
+        if let Some(component) = cached() {
+            drop(turn);
             return Ok((Prepared::new(Arc::clone(core), digest, &component)?, None));
         }
         let started = Instant::now();
-        let code = self.compile(bytes)?;
+        let exchange_in = self
+            .0
+            .cache
+            .as_ref()
+            .map_or_else(std::env::temp_dir, |c| PathBuf::from(c.dir()));
+        let code = compile(
+            &core.engine,
+            self.0.profile,
+            &self.0.compile,
+            limits,
+            &exchange_in,
+            bytes,
+        )?;
         let compile_time = started.elapsed();
         let component = self.load(&code)?;
         let prepared = Prepared::new(Arc::clone(core), digest, &component)?;
@@ -177,26 +198,8 @@ impl Engine {
         if let Some(cache) = &self.0.cache {
             cache.store(&digest, &code);
         }
+        drop(turn);
         Ok((prepared, Some(compile_time)))
-    }
-
-    fn compile(&self, bytes: &[u8]) -> Result<Vec<u8>, Error> {
-        let limits = &self.0.core.limits;
-        // One whole compilation may be ahead of this one; more is a crowd.
-        let _turn = self.0.compilations.enter(limits.compile_time_max * 2)?;
-        let exchange_in = self
-            .0
-            .cache
-            .as_ref()
-            .map_or_else(std::env::temp_dir, |c| PathBuf::from(c.dir()));
-        compile(
-            &self.0.core.engine,
-            self.0.profile,
-            &self.0.compile,
-            limits,
-            &exchange_in,
-            bytes,
-        )
     }
 
     fn load(&self, code: &[u8]) -> Result<Component, Error> {

@@ -41,3 +41,12 @@ pub use error::Error;
 pub use instance::{Instance, Origin};
 pub use prepared::Prepared;
 pub use profile::Profile;
+
+// Instances are stepped by whichever worker has the turn; the rest is shared by all of them.
+const _: () = {
+    const fn send<T: Send>() {}
+    const fn shared<T: Send + Sync>() {}
+    send::<Instance>();
+    shared::<Engine>();
+    shared::<Prepared>();
+};

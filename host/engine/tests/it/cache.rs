@@ -5,7 +5,7 @@ use std::{fs, os::unix::fs::PermissionsExt as _, path::Path};
 use bumpless_core::Digest;
 use bumpless_engine::{Config, Engine, Limits, cache_key};
 
-use crate::guest::{Guest, SECOND_NS, frame, state};
+use crate::guest::{Guest, PATIENCE_NS, frame, state};
 
 fn engine(dir: &Path, key: u8) -> Engine {
     Engine::new(Config {
@@ -33,7 +33,7 @@ fn compiled(engine: &Engine, bytes: &[u8]) -> bool {
     let effects = law
         .instantiate()
         .unwrap()
-        .step(&frame(1.0), &state(1.0), SECOND_NS)
+        .step(&frame(1.0), &state(1.0), PATIENCE_NS)
         .unwrap();
     assert_eq!(effects.writes, [(1, 2.0)]);
     engine.forget(&found.digest);
@@ -182,6 +182,28 @@ fn the_oldest_code_goes_first() {
     )
     .to_string();
     assert!(!left.iter().any(|p| p.to_str().unwrap().contains(&first)));
+}
+
+#[test]
+fn what_a_killed_host_left_behind_is_swept_away_and_live_work_is_not() {
+    let dir = tempfile::tempdir().unwrap();
+    drop(engine(dir.path(), 1));
+    let code = dir.path().join("code");
+    let old = std::time::SystemTime::now() - std::time::Duration::from_secs(7200);
+    for name in [".old-file", ".new-file", "other.txt"] {
+        fs::write(code.join(name), "x").unwrap();
+    }
+    fs::create_dir(code.join(".compile-1-1")).unwrap();
+    fs::write(code.join(".compile-1-1/in.wasm"), "x").unwrap();
+    for name in [".old-file", "other.txt", ".compile-1-1"] {
+        fs::File::open(code.join(name)).unwrap().set_modified(old).unwrap();
+    }
+    drop(engine(dir.path(), 1));
+    let names: Vec<_> = files(dir.path())
+        .iter()
+        .map(|p| p.file_name().unwrap().to_owned())
+        .collect();
+    assert_eq!(names, [".new-file", "other.txt"]);
 }
 
 #[test]

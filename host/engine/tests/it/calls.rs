@@ -3,14 +3,14 @@
 use bumpless_core::{AlarmChange, Fault, LogLevel, LogLine, Message, Mode, NoData, Priority, Reading};
 use bumpless_engine::Origin;
 
-use crate::guest::{Guest, SECOND_NS, frame, instance, prepare, state};
+use crate::guest::{Guest, PATIENCE_NS, frame, instance, prepare, state};
 
 #[test]
 fn a_step_reads_writes_and_returns_its_state() {
     let mut law = instance(&Guest::good());
-    let first = law.start(&[1.0], &[40.0], SECOND_NS).unwrap();
+    let first = law.start(&[1.0], &[40.0], PATIENCE_NS).unwrap();
     assert_eq!(first, state(40.0));
-    let effects = law.step(&frame(2.5), &first, SECOND_NS).unwrap();
+    let effects = law.step(&frame(2.5), &first, PATIENCE_NS).unwrap();
     assert_eq!(effects.state, state(42.5));
     assert_eq!(effects.writes, [(1, 42.5)]);
     assert!(effects.messages.is_empty() && effects.alarms.is_empty() && effects.log.is_empty());
@@ -26,7 +26,7 @@ fn a_state_is_taken_over() {
         state_layout: 7,
     };
     assert_eq!(
-        law.migrate(&from, &state(3.0), &[1.0], &[0.0], SECOND_NS).unwrap(),
+        law.migrate(&from, &state(3.0), &[1.0], &[0.0], PATIENCE_NS).unwrap(),
         state(3.0)
     );
 }
@@ -46,10 +46,10 @@ fn a_guests_own_faults_come_out_in_its_words_and_leave_it_alive() {
             state_layout: 1,
         };
         assert_eq!(
-            law.migrate(&from, &[], &[], &[], SECOND_NS).unwrap_err(),
+            law.migrate(&from, &[], &[], &[], PATIENCE_NS).unwrap_err(),
             fault("sum".to_owned())
         );
-        assert!(law.step(&frame(1.0), &state(0.0), SECOND_NS).is_ok());
+        assert!(law.step(&frame(1.0), &state(0.0), PATIENCE_NS).is_ok());
     }
 }
 
@@ -70,7 +70,7 @@ fn the_cycle_and_the_timer_tell_the_frames_numbers() {
     );
     let mut frame = frame(0.0);
     frame.readings[0] = Reading::unconnected();
-    let bytes = instance(&law).step(&frame, &[], SECOND_NS).unwrap().state;
+    let bytes = instance(&law).step(&frame, &[], PATIENCE_NS).unwrap().state;
     let numbers: Vec<u64> = bytes
         .chunks(8)
         .map(|c| u64::from_le_bytes(c.try_into().unwrap()))
@@ -78,7 +78,7 @@ fn the_cycle_and_the_timer_tell_the_frames_numbers() {
     assert_eq!(numbers, [7, 5000, 100, 5000, 100, 0b10, 2, 1, 3.0_f64.to_bits()]);
     frame.cycle.mode = Mode::Manual;
     frame.readings.truncate(1);
-    let bytes = instance(&law).step(&frame, &[], SECOND_NS).unwrap().state;
+    let bytes = instance(&law).step(&frame, &[], PATIENCE_NS).unwrap().state;
     assert_eq!(bytes[40], 0, "a port without a reading is not connected");
     assert_eq!(bytes[56], 0, "manual");
 }
@@ -91,7 +91,7 @@ fn readings_carry_quality_age_and_freshness() {
     let mut read = |reading| {
         let mut frame = frame(0.0);
         frame.readings[0] = reading;
-        let s = law.step(&frame, &[], SECOND_NS).unwrap().state;
+        let s = law.step(&frame, &[], PATIENCE_NS).unwrap().state;
         let age = u64::from_le_bytes(s[16..24].try_into().unwrap());
         (f64::from_le_bytes(s[..8].try_into().unwrap()), s[8], age, s[24])
     };
@@ -115,7 +115,7 @@ fn ports_are_found_by_name() {
          (call $find (i32.const 0) (i32.const 0) (i32.const 520))
          (call $ok (i32.const 512) (i32.const 16))",
     );
-    let found = instance(&law).step(&frame(0.0), &[], SECOND_NS).unwrap().state;
+    let found = instance(&law).step(&frame(0.0), &[], PATIENCE_NS).unwrap().state;
     assert_eq!((found[0], found[4]), (1, 1), "\"out\" is port 1");
     assert_eq!(found[8], 0, "no port is called nothing");
 }
@@ -141,7 +141,7 @@ fn messages_alarms_and_lines_travel_with_the_effects() {
     });
     let mut law = instance(&law);
     for _ in 0..2 {
-        let effects = law.step(&frame, &[], SECOND_NS).unwrap();
+        let effects = law.step(&frame, &[], PATIENCE_NS).unwrap();
         assert_eq!(
             effects.messages,
             [Message {
@@ -181,10 +181,10 @@ fn the_last_write_of_a_step_counts_and_none_is_kept_for_the_next() {
          (call $ok (local.get $state) (local.get $state_len))",
     );
     let mut law = instance(&law);
-    assert_eq!(law.step(&frame(0.0), &[], SECOND_NS).unwrap().writes, [(1, 2.0)]);
+    assert_eq!(law.step(&frame(0.0), &[], PATIENCE_NS).unwrap().writes, [(1, 2.0)]);
     let mut quiet = frame(0.0);
     quiet.cycle.setpoint = 0.0;
-    assert_eq!(law.step(&quiet, &[], SECOND_NS).unwrap().writes, []);
+    assert_eq!(law.step(&quiet, &[], PATIENCE_NS).unwrap().writes, []);
 }
 
 #[test]
@@ -192,13 +192,13 @@ fn a_fresh_and_a_used_instance_give_the_same_bytes() {
     let prepared = prepare(&Guest::good());
     let mut used = prepared.instantiate().unwrap();
     for i in 0..100 {
-        used.step(&frame(f64::from(i)), &state(0.1), SECOND_NS).unwrap();
+        used.step(&frame(f64::from(i)), &state(0.1), PATIENCE_NS).unwrap();
     }
     let mut fresh = prepared.instantiate().unwrap();
     for input in [0.1, -3.0, 1e300, f64::MIN_POSITIVE] {
         let (a, b) = (
-            used.step(&frame(input), &state(0.2), SECOND_NS),
-            fresh.step(&frame(input), &state(0.2), SECOND_NS),
+            used.step(&frame(input), &state(0.2), PATIENCE_NS),
+            fresh.step(&frame(input), &state(0.2), PATIENCE_NS),
         );
         assert_eq!(a.unwrap(), b.unwrap());
     }
@@ -216,7 +216,7 @@ fn nan_has_one_bit_pattern_on_every_host() {
     frame.cycle.setpoint = 0.0;
     let canonical = 0x7ff8_0000_0000_0000_u64.to_le_bytes();
     assert_eq!(
-        instance(&law).step(&frame, &[], SECOND_NS).unwrap().state,
+        instance(&law).step(&frame, &[], PATIENCE_NS).unwrap().state,
         [canonical, canonical].concat()
     );
 }

@@ -4,7 +4,7 @@ use std::{path::PathBuf, time::Duration};
 
 use bumpless_engine::{Compile, Config, Engine, Error, Limits, Profile, compile_child};
 
-use crate::guest::{Guest, SECOND_NS, frame, state};
+use crate::guest::{Guest, PATIENCE_NS, frame, state};
 
 /// Where the child's life begins. In an ordinary test run it has nothing to do.
 #[test]
@@ -57,7 +57,7 @@ fn a_child_compiles_for_both_shapes_of_memory() {
         let effects = law
             .instantiate()
             .unwrap()
-            .step(&frame(1.0), &state(1.0), SECOND_NS)
+            .step(&frame(1.0), &state(1.0), PATIENCE_NS)
             .unwrap();
         assert_eq!(effects.writes, [(1, 2.0)]);
         assert_eq!(leftovers(&dir), 0);

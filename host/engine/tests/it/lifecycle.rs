@@ -3,7 +3,7 @@
 use bumpless_core::Digest;
 use bumpless_engine::{Capacity, Config, Engine, Error, Limits, Profile};
 
-use crate::guest::{Guest, SECOND_NS, engine_for, frame, state};
+use crate::guest::{Guest, PATIENCE_NS, engine_for, frame, state};
 
 #[test]
 fn instances_are_refused_beyond_the_limit_and_places_come_back() {
@@ -69,7 +69,7 @@ fn a_component_is_prepared_once_and_forgotten_on_request() {
     assert!(engine.prepared(&digest).is_none());
     // Even without the engine an instance that lives goes on.
     drop((first, engine));
-    assert!(living.step(&frame(1.0), &state(1.0), SECOND_NS).is_ok());
+    assert!(living.step(&frame(1.0), &state(1.0), PATIENCE_NS).is_ok());
 }
 
 #[test]
@@ -100,31 +100,6 @@ fn the_table_of_components_is_bounded() {
 }
 
 #[test]
-fn ten_thousand_instances_come_and_go_without_growth() {
-    // Both shapes of memory: slots, and allocation on demand.
-    for (instances_max, profile) in [(4, Profile::Pooled), (8001, Profile::OnDemand)] {
-        let engine = engine_for(instances_max);
-        assert_eq!(engine.profile(), profile);
-        let law = engine.prepare(&Guest::good().build()).unwrap();
-        let once = |n: u32| {
-            for _ in 0..n {
-                law.instantiate()
-                    .unwrap()
-                    .step(&frame(1.0), &state(1.0), SECOND_NS)
-                    .unwrap();
-            }
-        };
-        once(500);
-        let before = resident_kib();
-        once(10_000);
-        let grown = resident_kib().saturating_sub(before);
-        // One leaked instance has at least its two pages of memory: 10,000 would be 80 MiB and more.
-        assert!(grown < 16 * 1024, "{profile:?} grew by {grown} KiB");
-        assert_eq!(engine.capacity().instances_used, 0);
-    }
-}
-
-#[test]
 fn a_thousand_instances_live_beside_each_other() {
     for (instances_max, profile) in [(1000, Profile::Pooled), (9000, Profile::OnDemand)] {
         let engine = engine_for(instances_max);
@@ -132,14 +107,8 @@ fn a_thousand_instances_live_beside_each_other() {
         let law = engine.prepare(&Guest::good().build()).unwrap();
         let mut all: Vec<_> = (0..1000).map(|_| law.instantiate().unwrap()).collect();
         for (i, one) in (0_u32..).zip(&mut all) {
-            let sum = one.step(&frame(1.0), &state(f64::from(i)), SECOND_NS).unwrap();
+            let sum = one.step(&frame(1.0), &state(f64::from(i)), PATIENCE_NS).unwrap();
             assert_eq!(sum.writes, [(1, f64::from(i) + 1.0)]);
         }
     }
-}
-
-/// Memory of this process in RAM. Other tests of this binary run beside and use some too, hence the wide margin above.
-fn resident_kib() -> u64 {
-    let pages = std::fs::read_to_string("/proc/self/statm").unwrap();
-    pages.split(' ').nth(1).unwrap().parse::<u64>().unwrap() * 4
 }

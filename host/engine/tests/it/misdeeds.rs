@@ -2,7 +2,7 @@
 
 use bumpless_core::Fault;
 
-use crate::guest::{Guest, SECOND_NS, engine_for, frame, instance, state};
+use crate::guest::{Guest, PATIENCE_NS, engine_for, frame, instance, state};
 
 /// Misbehaves where the setpoint is not 0, and is the good law otherwise.
 fn sometimes(misdeed: &str) -> Guest {
@@ -127,14 +127,14 @@ fn each_misdeed_is_a_fault_and_the_next_step_works() {
         };
         let mut law = instance(&guest);
         assert_eq!(
-            law.step(&frame(1.0), &state(1.0), SECOND_NS).unwrap_err(),
+            law.step(&frame(1.0), &state(1.0), PATIENCE_NS).unwrap_err(),
             strip_step(expected),
             "{what}"
         );
         let mut good = frame(1.0);
         good.cycle.setpoint = 0.0;
         assert_eq!(
-            law.step(&good, &state(1.0), SECOND_NS).unwrap().writes,
+            law.step(&good, &state(1.0), PATIENCE_NS).unwrap().writes,
             [(1, 2.0)],
             "after: {what}"
         );
@@ -167,7 +167,7 @@ fn a_spinning_step_is_stopped_and_the_next_works() {
             Fault::Overrun { limit_us: 3000 }
         );
         assert!(law.last_step_ns() >= 3_000_000, "not before its limit");
-        assert!(law.step(&good, &state(1.0), SECOND_NS).is_ok());
+        assert!(law.step(&good, &state(1.0), PATIENCE_NS).is_ok());
     }
 }
 
@@ -189,7 +189,7 @@ fn endless_recursion_is_a_trap() {
         extra: "(func $deep (param i32) (result i32) (i32.add (call $deep (local.get 0)) (i32.const 1)))".into(),
         ..Guest::step("(call $deep (i32.const 0))")
     };
-    let fault = instance(&deep).step(&frame(1.0), &[], SECOND_NS).unwrap_err();
+    let fault = instance(&deep).step(&frame(1.0), &[], PATIENCE_NS).unwrap_err();
     assert_eq!(fault, Fault::Trap("call stack exhausted in deep".to_owned()));
 }
 
@@ -206,7 +206,7 @@ fn a_flood_of_lines_costs_lines_and_no_cycle() {
              (call $ok (local.get $state) (local.get $state_len))",
         )
     };
-    let effects = instance(&flood).step(&frame(1.0), &state(1.0), SECOND_NS).unwrap();
+    let effects = instance(&flood).step(&frame(1.0), &state(1.0), PATIENCE_NS).unwrap();
     assert_eq!(effects.state, state(1.0));
     assert_eq!(effects.log.len(), 16);
     assert_eq!(effects.log[0].text.chars().count(), 512);
@@ -231,7 +231,7 @@ fn effects_outside_a_step_are_refused() {
             start: format!("{body} (call $ok (i32.const 0) (i32.const 0))"),
             ..Guest::good()
         };
-        let fault = instance(&guest).start(&[], &[], SECOND_NS).unwrap_err();
+        let fault = instance(&guest).start(&[], &[], PATIENCE_NS).unwrap_err();
         assert_eq!(
             fault,
             Fault::Failed(format!("it tried to {expected} outside a step")),
@@ -252,7 +252,7 @@ fn one_guests_overrun_does_not_touch_its_neighbours() {
         let spinning = scope.spawn(move || bad.step(&frame(1.0), &state(0.0), 20_000_000).unwrap_err());
         let mut sum = state(0.0);
         while !spinning.is_finished() {
-            sum = good.step(&frame(1.0), &sum, SECOND_NS).unwrap().state;
+            sum = good.step(&frame(1.0), &sum, PATIENCE_NS).unwrap().state;
         }
         assert_eq!(spinning.join().unwrap(), Fault::Overrun { limit_us: 20_000 });
     });

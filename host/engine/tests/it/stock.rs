@@ -3,9 +3,9 @@
 use std::{path::PathBuf, sync::OnceLock};
 
 use bumpless_core::{Cycle, Descriptor, Fault, Frame, Mode, Reading};
-use bumpless_engine::{Config, Engine, Error, Instance, Limits, Origin};
+use bumpless_engine::{Config, Engine, Error, Instance, Origin};
 
-use crate::guest::SECOND_NS;
+use crate::guest::PATIENCE_NS;
 
 /// Time limit of the calls that are expected to pass it.
 const SHORT_NS: u64 = 20_000_000;
@@ -17,20 +17,14 @@ fn component(name: &str) -> Vec<u8> {
 }
 
 fn engine() -> Engine {
-    // Real components take longer to compile and describe themselves where nothing is optimised.
-    let limits = Limits {
-        describe_time_max: std::time::Duration::from_millis(500),
-        ..Limits::default()
-    };
     Engine::new(Config {
         instances_max: 4,
-        limits,
         ..Config::default()
     })
     .expect("engine")
 }
 
-/// One reading per port: 40 at each input, 50 at each output, and unconnected where a port is not required.
+/// The measurement as given, 50 at the actuator, and nothing else connected.
 fn frame(descriptor: &Descriptor, seq: u64, pv: f64) -> Frame {
     let at_ns = seq * 100_000_000;
     let readings = descriptor.ports.iter().map(|port| match port.name.as_str() {
@@ -57,7 +51,7 @@ fn started(instance: &mut Instance, given: &[(&str, f64)]) -> Vec<u8> {
         .descriptor()
         .parameter_values(given.iter().copied())
         .unwrap();
-    instance.start(&parameters, &[50.0], SECOND_NS).unwrap()
+    instance.start(&parameters, &[50.0], PATIENCE_NS).unwrap()
 }
 
 #[test]
@@ -70,30 +64,39 @@ fn stock_controllers_start_where_the_actuator_is_and_take_over_each_others_state
         let out = u8::try_from(d.port("out").unwrap()).unwrap();
         let mut one = law.instantiate().unwrap();
         let mut state = started(&mut one, &[]);
-        let first = one.step(&frame(&d, 1, 40.0), &state, SECOND_NS).unwrap();
+        let first = one.step(&frame(&d, 1, 40.0), &state, PATIENCE_NS).unwrap();
         assert_eq!(first.writes, [(out, 50.0)], "{name} starts without a bump");
-        state = one.step(&frame(&d, 2, 40.0), &first.state, SECOND_NS).unwrap().state;
+        state = one.step(&frame(&d, 2, 40.0), &first.state, PATIENCE_NS).unwrap().state;
 
         // A used and a fresh instance agree bit by bit.
         let mut fresh = law.instantiate().unwrap();
         let again = frame(&d, 3, 41.0);
         assert_eq!(
-            one.step(&again, &state, SECOND_NS).unwrap(),
-            fresh.step(&again, &state, SECOND_NS).unwrap(),
+            one.step(&again, &state, PATIENCE_NS).unwrap(),
+            fresh.step(&again, &state, PATIENCE_NS).unwrap(),
             "{name}"
         );
 
-        // Its own state with other parameters, and a state that is nonsense.
-        let from = Origin {
-            name: d.name.clone(),
-            version: d.version.clone(),
-            state_layout: d.state_layout,
-        };
+        // Its own state and the other's go on where they were; nonsense is refused.
         let parameters = d.parameter_values([]).unwrap();
-        let moved = one.migrate(&from, &state, &parameters, &[50.0], SECOND_NS).unwrap();
-        assert!(one.step(&frame(&d, 3, 40.0), &moved, SECOND_NS).is_ok());
+        for from in ["pid", "pidplus"] {
+            let other = engine.prepare(&component(from)).unwrap();
+            let said = other.descriptor();
+            let origin = Origin {
+                name: said.name.clone(),
+                version: said.version.clone(),
+                state_layout: said.state_layout,
+            };
+            let mut other = other.instantiate().unwrap();
+            let left = started(&mut other, &[]);
+            let left = other.step(&frame(&d, 1, 40.0), &left, PATIENCE_NS).unwrap().state;
+            let taken = one.migrate(&origin, &left, &parameters, &[50.0], PATIENCE_NS).unwrap();
+            let writes = one.step(&frame(&d, 2, 40.0), &taken, PATIENCE_NS).unwrap().writes;
+            let same = other.step(&frame(&d, 2, 40.0), &left, PATIENCE_NS).unwrap().writes;
+            assert_eq!(writes, same, "{from} to {name}");
+        }
         assert!(matches!(
-            one.step(&frame(&d, 3, 40.0), &[0xFF; 40], SECOND_NS).unwrap_err(),
+            one.step(&frame(&d, 3, 40.0), &[0xFF; 40], PATIENCE_NS).unwrap_err(),
             Fault::BadState(_)
         ));
     }
@@ -107,11 +110,11 @@ fn stock_controllers_say_what_they_lack() {
     let mut frame = frame(law.descriptor(), 1, 40.0);
     frame.readings.clear();
     assert!(matches!(
-        one.step(&frame, &state, SECOND_NS).unwrap_err(),
+        one.step(&frame, &state, PATIENCE_NS).unwrap_err(),
         Fault::BadInput(_)
     ));
     assert!(matches!(
-        one.start(&[1.0], &[50.0], SECOND_NS).unwrap_err(),
+        one.start(&[1.0], &[50.0], PATIENCE_NS).unwrap_err(),
         Fault::BadParameter(_)
     ));
 }
@@ -122,7 +125,7 @@ fn guests_that_are_no_controllers_are_refused() {
     let refused = |name: &str| engine.prepare(&component(&format!("guests/{name}"))).unwrap_err();
     assert!(matches!(
         refused("describe-spins"),
-        Error::Describe(Fault::Overrun { limit_us: 500_000 })
+        Error::Describe(Fault::Overrun { limit_us: 1_000_000 })
     ));
     assert!(matches!(refused("lies-in-describe"), Error::Descriptor(_)));
     assert!(matches!(
@@ -193,13 +196,13 @@ fn guests_misdeeds_are_faults() {
         let law = engine.prepare(&component(&format!("guests/{name}"))).unwrap();
         let d = law.descriptor();
         let mut one = law.instantiate().unwrap();
-        let limit_ns = if name == "spins" { SHORT_NS } else { SECOND_NS };
+        let limit_ns = if name == "spins" { SHORT_NS } else { PATIENCE_NS };
         let bad = started(&mut one, &[given, &[("after", 0.0)]].concat());
         let fault = one.step(&frame(d, 1, 40.0), &bad, limit_ns).unwrap_err();
         assert!(expected(&fault), "{name} {given:?}: {fault:?}");
         // The same instance then serves a state that does not misbehave yet.
         let good = started(&mut one, &[("after", 1.0)]);
-        let effects = one.step(&frame(d, 2, 40.0), &good, SECOND_NS).unwrap();
+        let effects = one.step(&frame(d, 2, 40.0), &good, PATIENCE_NS).unwrap();
         assert_eq!(effects.writes, [(1, 50.0)], "{name}");
     }
 }
@@ -213,7 +216,7 @@ fn guests_that_do_not_start_or_take_over_say_so() {
     let parameters = law.descriptor().parameter_values([]).unwrap();
     let mut one = law.instantiate().unwrap();
     assert!(matches!(
-        one.start(&parameters, &[50.0], SECOND_NS).unwrap_err(),
+        one.start(&parameters, &[50.0], PATIENCE_NS).unwrap_err(),
         Fault::Failed(_) | Fault::BadParameter(_)
     ));
 
@@ -238,7 +241,8 @@ fn guests_that_do_not_start_or_take_over_say_so() {
     };
     let parameters = d.parameter_values([]).unwrap();
     assert!(matches!(
-        one.migrate(&from, &state, &parameters, &[50.0], SECOND_NS).unwrap_err(),
+        one.migrate(&from, &state, &parameters, &[50.0], PATIENCE_NS)
+            .unwrap_err(),
         Fault::BadState(_)
     ));
 }
@@ -248,7 +252,9 @@ fn a_guest_that_floods_its_log_loses_lines_and_no_cycle() {
     let law = engine().prepare(&component("guests/floods-log")).unwrap();
     let mut one = law.instantiate().unwrap();
     let state = started(&mut one, &[("after", 0.0)]);
-    let effects = one.step(&frame(law.descriptor(), 1, 40.0), &state, SECOND_NS).unwrap();
+    let effects = one
+        .step(&frame(law.descriptor(), 1, 40.0), &state, PATIENCE_NS)
+        .unwrap();
     assert_eq!(effects.writes, [(1, 50.0)]);
     assert_eq!(effects.log.len(), 16);
     assert_eq!(
