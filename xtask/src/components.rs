@@ -294,6 +294,19 @@ fn ensure_target() -> Result<(), Error> {
         .map_err(|e| Error::Target(Box::new(e)))
 }
 
+/// Compiler flags, as a cargo setting that is joined with `.cargo/config.toml`: panic messages name files, and without these
+/// the same source would give other bytes, and so another digest, in another folder.
+fn path_flags() -> String {
+    let cargo_home = std::env::var_os("CARGO_HOME").map(PathBuf::from);
+    let cargo_home = cargo_home.or_else(|| std::env::home_dir().map(|home| home.join(".cargo")));
+    let folders = [(cargo_home, "/cargo"), (Some(workspace_root().to_owned()), "/bumpless")];
+    let flags = folders
+        .into_iter()
+        .filter_map(|(from, to)| from.map(|f| format!("--remap-path-prefix={}={to}", f.display())));
+    // A path as a TOML text needs the quoting of Rust's.
+    format!("target.{TARGET}.rustflags={:?}", flags.collect::<Vec<_>>())
+}
+
 /// Builds the modules; gives for each package its module and whether it was up to date.
 fn cargo_build(sources: &[Source]) -> Result<Vec<(String, PathBuf, bool)>, Error> {
     let mut cargo = command("cargo");
@@ -307,6 +320,7 @@ fn cargo_build(sources: &[Source]) -> Result<Vec<(String, PathBuf, bool)>, Error
         "--message-format",
         "json-render-diagnostics",
     ]);
+    cargo.args(["--config", &path_flags()]);
     for source in sources {
         cargo.args(["--package", &source.package]);
     }
