@@ -13,7 +13,7 @@
 //!
 //! A loop lives on one worker of each host, chosen by its name, so nothing of a loop is shared between threads.
 //!
-//! Reading order: `handle` (what others may ask), `worker` (the thread), `home`, `seat`, `calls`, then `replicas`, `wire`.
+//! Reading order: `handle` (what others may ask), `worker` (the thread), `home`, `seat`, `revise`, `calls`, then `replicas`, `wire`.
 
 mod calls;
 mod error;
@@ -21,6 +21,7 @@ mod event;
 mod handle;
 mod home;
 mod replicas;
+mod revise;
 mod seat;
 mod shared;
 mod wire;

@@ -1,0 +1,265 @@
+//! Going on with another revision inside a cycle: forwards when a command asks for it, backwards when probation fails.
+//!
+//! Both components step on the same frame here, on the owner, so the bump is measured and not guessed.
+//! Never: asks a replica; a switch is one host's work within one cycle.
+
+use std::sync::Arc;
+
+use bumpless_core::{
+    CommandId, Effects, Event as CycleEvent, Fault, Frame, LoopId, Outcome, Reading, guard, seat::Stepped, swap,
+};
+use bumpless_engine::Origin;
+
+use crate::{
+    event::HeldRevision,
+    seat::{Running, Seat},
+    worker::Worker,
+};
+
+/// A first state, or one taken over: `migrate`, and `start` from what the actuators hold where that is declined.
+pub(crate) fn take_over(
+    held: &mut HeldRevision,
+    from: Option<(&Origin, &[u8])>,
+    track: &[f64],
+    limit_ns: u64,
+) -> Result<(Vec<u8>, &'static str), Fault> {
+    if let Some((origin, state)) = from.filter(|(_, state)| !state.is_empty())
+        && let Ok(state) = held
+            .instance
+            .migrate(origin, state, &held.wiring.parameters, track, limit_ns)
+    {
+        return Ok((state, "migrate"));
+    }
+    held.instance
+        .start(&held.wiring.parameters, track, limit_ns)
+        .map(|state| (state, "start"))
+}
+
+/// What the actuators hold, with the safe value where that is not known.
+pub(crate) fn track(held: &HeldRevision, readings: &[Reading]) -> Vec<f64> {
+    let values = held.wiring.held(readings);
+    values
+        .iter()
+        .zip(&held.wiring.limits)
+        .map(|(v, l)| if v.is_finite() { *v } else { l.safe })
+        .collect()
+}
+
+fn origin(held: &HeldRevision) -> Origin {
+    Origin {
+        name: held.descriptor.name.clone(),
+        version: held.descriptor.version.clone(),
+        state_layout: held.descriptor.state_layout,
+    }
+}
+
+pub(crate) fn missing_input(held: &HeldRevision, port: u8) -> Fault {
+    let name = held
+        .descriptor
+        .ports
+        .get(usize::from(port))
+        .map_or_else(|| port.to_string(), |p| p.name.clone());
+    Fault::BadInput(format!("{name} has no usable value"))
+}
+
+impl Worker {
+    /// No good step. In probation, the old component gets this very cycle; else the loop's policy decides.
+    pub(crate) fn without_a_step(&mut self, id: &LoopId, mut running: Running, fault: Fault) {
+        let back = running
+            .base
+            .as_ref()
+            .and_then(|r| r.probation)
+            .map(|(revision, _)| revision);
+        let Some(seat) = self.seats.get_mut(id) else { return };
+        let places = back.and_then(|back| {
+            let new = seat
+                .held
+                .iter()
+                .position(|h| h.spec.revision == running.sample.revision)?;
+            let old = seat.held.iter().position(|h| h.spec.revision == back)?;
+            Some((new, old))
+        });
+        let Some((new, old)) = places else {
+            return self.conclude(id, running, Err(fault));
+        };
+        let readings = seat.held[new]
+            .wiring
+            .remap(&running.frame.readings, &seat.held[old].wiring);
+        let from = origin(&seat.held[new]);
+        let held = &mut seat.held[old];
+        let limit_ns = held.spec.step_limit_ns();
+        let actuators = track(held, &readings);
+        let frame = Frame {
+            readings: readings.clone(),
+            ..running.frame.clone()
+        };
+        let began_ns = self.shared.now_ns();
+        let step = match held.wiring.bad_input(&readings) {
+            Some(port) => Err(missing_input(held, port)),
+            None => take_over(held, Some((&from, &running.state)), &actuators, limit_ns).and_then(|(state, _)| {
+                running.state = Arc::from(state);
+                held.instance.step(&frame, &running.state, limit_ns)
+            }),
+        };
+        let step_ns = self.shared.now_ns() - began_ns;
+        running.events.push(CycleEvent::RolledBack {
+            from: running.sample.revision,
+            reason: fault.to_string(),
+        });
+        let by = self.shared.here.clone();
+        let step = step.map(|effects| Stepped { effects, by, step_ns });
+        self.conclude_with(id, running, step, old, readings, None);
+    }
+
+    /// A change of revision: both components step on the same frame here, and the bump decides.
+    pub(crate) fn revise(&mut self, id: &LoopId, mut running: Running, command: CommandId, revision: u64) {
+        let Some(seat) = self.seats.get_mut(id) else { return };
+        let Some(old_index) = seat
+            .held
+            .iter()
+            .position(|h| h.spec.revision == running.sample.revision)
+        else {
+            return;
+        };
+        let began_ns = self.shared.now_ns();
+        // The old component first: whatever the new one does, this cycle has an answer.
+        let old = &mut seat.held[old_index];
+        let limit_ns = old.spec.step_limit_ns();
+        let old_step = old.instance.step(&running.frame, &running.state, limit_ns);
+        let attempt = match seat.held.iter().position(|h| h.spec.revision == revision) {
+            Some(new_index) if new_index != old_index => {
+                try_revision(seat, old_index, new_index, &running, old_step.as_ref().ok())
+            }
+            Some(_) => Err(format!("revision {revision} is in force already")),
+            None => Err(format!(
+                "revision {revision} is not prepared on {}, the loop's owner",
+                self.shared.here
+            )),
+        };
+        let step_ns = self.shared.now_ns() - began_ns;
+        let by = self.shared.here.clone();
+        match attempt {
+            Ok(tried) => {
+                running.events.push(CycleEvent::Revised {
+                    from: running.sample.revision,
+                    from_digest: seat.held[old_index].spec.digest,
+                    by: tried.by.to_owned(),
+                    bump_percent: tried.bump_percent,
+                });
+                running.standing.remember(command, Outcome::Done);
+                let spec = &seat.held[tried.index].spec;
+                let probation = (spec.policy.probation_cycles > 0 && tried.by != "same")
+                    .then_some((running.sample.revision, spec.policy.probation_cycles));
+                if running.standing.manual.len() != spec_outputs(&seat.held[tried.index]) {
+                    running.standing.manual = track(&seat.held[tried.index], &tried.readings);
+                }
+                running.state = tried.state;
+                let step = Ok(Stepped {
+                    effects: tried.effects,
+                    by,
+                    step_ns,
+                });
+                self.conclude_with(id, running, step, tried.index, tried.readings, probation);
+            }
+            Err(reason) => {
+                running.standing.remember(command, Outcome::Refused(reason));
+                match old_step {
+                    Ok(effects) => self.conclude(id, running, Ok(Stepped { effects, by, step_ns })),
+                    Err(fault) => self.without_a_step(id, running, fault),
+                }
+            }
+        }
+    }
+}
+
+/// A new revision that may take over.
+struct Tried {
+    index: usize,
+    readings: Vec<Reading>,
+    state: Arc<[u8]>,
+    effects: Effects,
+    by: &'static str,
+    bump_percent: f64,
+}
+
+fn spec_outputs(held: &HeldRevision) -> usize {
+    held.wiring.outputs.len()
+}
+
+/// Hands the state over, steps the new component on the same frame and measures the bump. Says in words why not.
+fn try_revision(
+    seat: &mut Seat,
+    old_index: usize,
+    new_index: usize,
+    running: &Running,
+    old_effects: Option<&Effects>,
+) -> Result<Tried, String> {
+    let old = &seat.held[old_index];
+    let readings = match &running.sample.next_readings {
+        Some((revision, readings)) if *revision == seat.held[new_index].spec.revision => readings.clone(),
+        _ => old.wiring.remap(&running.frame.readings, &seat.held[new_index].wiring),
+    };
+    let (from, hand_over) = (origin(old), swap::hand_over(&old.spec, &seat.held[new_index].spec));
+    let dt_ns = running.frame.cycle.dt_ns;
+    let mode = running.standing.mode;
+    let actuators_old = track(old, &running.frame.readings);
+    // What the old controller would have sent; where it has no answer, it would have held.
+    let old_outputs = old_effects.map_or_else(
+        || actuators_old.clone(),
+        |effects| {
+            let wanted = old.wiring.wanted(&effects.writes, &actuators_old);
+            let manual = &running.standing.manual;
+            guard::guard(mode, &wanted, manual, &actuators_old, &old.wiring.limits, dt_ns).outputs
+        },
+    );
+    let new = &mut seat.held[new_index];
+    if readings.len() != new.wiring.points.len() {
+        return Err("the sample's readings do not fit the new component's ports".to_owned());
+    }
+    if let Some(port) = new.wiring.bad_input(&readings) {
+        return Err(missing_input(new, port).to_string());
+    }
+    let limit_ns = new.spec.step_limit_ns();
+    let actuators = track(new, &readings);
+    let (state, by): (Arc<[u8]>, _) = match hand_over {
+        swap::HandOver::Same => (Arc::clone(&running.state), "same"),
+        swap::HandOver::Migrate => take_over(new, Some((&from, &running.state)), &actuators, limit_ns)
+            .map(|(state, by)| (Arc::from(state), by))
+            .map_err(|fault| format!("no state could be made for the new component: {fault}"))?,
+    };
+    let frame = Frame {
+        readings: readings.clone(),
+        ..running.frame.clone()
+    };
+    let effects = new
+        .instance
+        .step(&frame, &state, limit_ns)
+        .map_err(|fault| format!("its first step failed: {fault}"))?;
+    let wanted = new.wiring.wanted(&effects.writes, &actuators);
+    let manual = if running.standing.manual.len() == actuators.len() {
+        &running.standing.manual
+    } else {
+        &actuators
+    };
+    let new_outputs = guard::guard(mode, &wanted, manual, &actuators, &new.wiring.limits, dt_ns).outputs;
+    let spans: Vec<f64> = (0..new_outputs.len()).map(|i| new.wiring.span(i)).collect();
+    // Outputs that the old component did not drive are compared with what their actuators hold.
+    let same_ports = old_outputs.len() == new_outputs.len();
+    let compared = if same_ports { &old_outputs } else { &actuators };
+    let bump_percent = swap::bump_percent(compared, &new_outputs, &spans);
+    let limit = new.spec.policy.bump_limit_percent;
+    if bump_percent > limit {
+        return Err(format!(
+            "the output would step by {bump_percent:.3} % of its span beyond what the old controller does; \
+             the loop allows {limit} % (policy.bump_limit_percent)"
+        ));
+    }
+    Ok(Tried {
+        index: new_index,
+        readings,
+        state,
+        effects,
+        by,
+        bump_percent,
+    })
+}
