@@ -27,7 +27,7 @@ pub struct Vitals {
     pub roles: Roles,
     /// Where its API listens, as `address:port`, if it serves one.
     pub api: Option<String>,
-    /// Load of the whole machine, 0 to 1 over all its processors.
+    /// Load of the processors that the process may run on, by anyone, 0 to 1.
     pub cpu: f32,
     /// This process's part of it, 0 to 1.
     pub cpu_process: f32,
