@@ -1,0 +1,219 @@
+//! Builds a host's rooms from the bottom up, wires their outlets, and takes them down from the top.
+//!
+//! ```text
+//! clock, store, engine, io ─► bus ─► loops ─► deploy ─► api        (start)
+//! api ─► deploy drains ─► loops ─► io ─► bus ─► record writer      (stop)
+//! ```
+//! Never: decides anything else. What arrives before loops and deployment exist waits in a bounded list.
+
+use std::{
+    net::SocketAddr,
+    sync::{Arc, Mutex, OnceLock, PoisonError},
+    time::Duration,
+};
+
+use bumpless_cell::{Arrival, Roles, Session};
+use bumpless_deploy::{Deploy, DeployArrival, Parts};
+use bumpless_engine::Engine;
+use bumpless_io::{Clock, IoServer};
+use bumpless_loops::{Loops, LoopsEvent};
+use bumpless_store::{RecordWriter, Store};
+use tokio::{
+    net::TcpListener,
+    sync::{mpsc, watch},
+    task::JoinHandle,
+    time::timeout,
+};
+
+use crate::{config::Config, error::Error};
+
+/// Arrivals kept until the rooms above the bus are there; a host that starts hears of its peers, and little more.
+const EARLY_MAX: usize = 4096;
+/// Longest wait for the API to finish its requests at the end.
+const API_STOP_TIMEOUT: Duration = Duration::from_secs(10);
+
+/// A host that runs.
+#[derive(Debug)]
+pub struct Running {
+    /// Where the API listens.
+    pub api: SocketAddr,
+    /// Where other hosts reach this one.
+    pub locators: Vec<String>,
+    deploy: Deploy,
+    loops: Loops,
+    io: Option<Arc<IoServer>>,
+    session: Session,
+    stop_api: watch::Sender<bool>,
+    api_task: JoinHandle<Result<(), bumpless_api::Error>>,
+    failures: mpsc::Receiver<Error>,
+}
+
+/// Joins the bus and the loops with those who listen to them.
+#[derive(Default)]
+struct Outlets {
+    loops: OnceLock<Loops>,
+    deploy: OnceLock<Deploy>,
+    early: Mutex<Option<Vec<Arrival>>>,
+}
+
+impl Outlets {
+    fn new() -> Self {
+        Self { early: Mutex::new(Some(Vec::new())), ..Self::default() }
+    }
+
+    fn arrive(&self, arrival: Arrival) {
+        let (Some(loops), Some(deploy)) = (self.loops.get(), self.deploy.get()) else {
+            let mut early = self.early.lock().unwrap_or_else(PoisonError::into_inner);
+            match early.as_mut() {
+                Some(waiting) if waiting.len() < EARLY_MAX => waiting.push(arrival),
+                Some(_) => {}
+                None => {
+                    // The rooms came between the look above and the lock.
+                    drop(early);
+                    self.arrive(arrival);
+                }
+            }
+            return;
+        };
+        if let Some(rest) = loops.arrive(arrival) {
+            deploy.arrive(DeployArrival::Bus(rest));
+        }
+    }
+
+    fn open(&self) {
+        let waiting = self.early.lock().unwrap_or_else(PoisonError::into_inner).take();
+        for arrival in waiting.into_iter().flatten() {
+            self.arrive(arrival);
+        }
+    }
+}
+
+/// Starts a host. When this returns, it has joined its cell and its API answers.
+///
+/// # Errors
+/// The first room that does not start, with its own words; what was started before it ends with its last handle.
+pub async fn run(config: Config) -> Result<Running, Error> {
+    let clock = Clock::start();
+    let data = config.data.clone();
+    let store = blocking(move || Store::open(&data)).await?.map_err(|e| Error::start("the store", e))?;
+    let writer = RecordWriter::start(store.clone()).map_err(|e| Error::start("the record writer", e))?;
+    let mut engine_config = config.engine.clone();
+    engine_config.cache_dir = Some(config.data.join("compiled"));
+    engine_config.cache_key = store.secret("compiled-code").map_err(|e| Error::start("the store", e))?;
+    let engine = blocking(move || Engine::new(engine_config)).await?.map_err(|e| Error::start("the engine", e))?;
+    let io = if config.io {
+        let runtime = tokio::runtime::Handle::current();
+        let server = IoServer::open(&config.buses, clock, &runtime).map_err(|e| Error::start("the I/O", e))?;
+        Some(Arc::new(server))
+    } else {
+        None
+    };
+    let listener = TcpListener::bind(config.api_listen).await.map_err(|source| {
+        let place = format!("the API on {}: choose another address with [api] listen", config.api_listen);
+        Error::start("the API", format!("{place} ({source})"))
+    })?;
+    let api = listener.local_addr().map_err(|e| Error::start("the API", e))?;
+
+    let outlets = Arc::new(Outlets::new());
+    let (fail, failures) = mpsc::channel(4);
+    let sink = {
+        let outlets = Arc::clone(&outlets);
+        Arc::new(move |arrival| match arrival {
+            Arrival::NameTaken { instance } => {
+                let reason = format!("another process of the cell (instance {instance}) has this host's name");
+                let source = format!("{reason}; give each host its own name");
+                // A full list already holds a reason to stop.
+                drop(fail.try_send(Error::Failed { what: "joining the cell", source: source.into() }));
+            }
+            other => outlets.arrive(other),
+        })
+    };
+    let session = Session::open(&config.cell, sink).await.map_err(|e| Error::start("the bus", e))?;
+    let locators = session.locators();
+    let report = {
+        let outlets = Arc::clone(&outlets);
+        Arc::new(move |event: LoopsEvent| {
+            if let Some(deploy) = outlets.deploy.get() {
+                deploy.arrive(DeployArrival::Loops(event));
+            }
+        })
+    };
+    let wire = Arc::new(session.clone());
+    let loops = Loops::start(&config.loops, config.host.clone(), clock, io.clone(), engine.clone(), wire, report)
+        .map_err(|e| Error::start("the loops", e))?;
+    let deploy = Deploy::start(Parts {
+        session: session.clone(),
+        store,
+        writer: Arc::new(writer),
+        engine,
+        io: io.clone(),
+        clock,
+        field: Arc::new(loops.clone()),
+        roles: Roles { io: config.io, control: config.control },
+        api: Some(format!("http://{api}")),
+        version: env!("CARGO_PKG_VERSION").to_owned(),
+    })
+    .map_err(|e| Error::start("deployment", e))?;
+    // Set once, here; nobody else could have.
+    drop(outlets.loops.set(loops.clone()));
+    drop(outlets.deploy.set(deploy.clone()));
+    outlets.open();
+
+    let (stop_api, mut stopping) = watch::channel(false);
+    let stopped = async move {
+        // An error means that the sender is gone, and so is the host.
+        drop(stopping.wait_for(|stop| *stop).await);
+    };
+    let serving = bumpless_api::serve(listener, deploy.clone(), bumpless_api::Options::default(), stopped);
+    let api_task = tokio::spawn(serving);
+    Ok(Running { api, locators, deploy, loops, io, session, stop_api, api_task, failures })
+}
+
+impl Running {
+    /// Waits until the host cannot go on, and says why.
+    pub async fn failed(&mut self) -> Error {
+        tokio::select! {
+            failure = self.failures.recv() => match failure {
+                Some(error) => error,
+                // The bus has let go of its sink, so it is closed.
+                None => Error::Failed { what: "the bus", source: "it is closed".into() },
+            },
+            ended = &mut self.api_task => match ended {
+                Ok(Ok(())) => Error::Failed { what: "the API", source: "it ended".into() },
+                Ok(Err(error)) => Error::Failed { what: "the API", source: error.into() },
+                Err(error) => Error::Failed { what: "the API", source: error.into() },
+            },
+        }
+    }
+
+    /// Leaves the cell in order: hands its loops to others, then stops every room.
+    pub async fn stop(self) {
+        self.deploy.shutdown().await;
+        self.stop_api.send_replace(true);
+        if !self.api_task.is_finished() {
+            match timeout(API_STOP_TIMEOUT, self.api_task).await {
+                Ok(Ok(Ok(()))) => {}
+                Ok(Ok(Err(error))) => tracing::warn!(%error, "the API ended with an error"),
+                Ok(Err(error)) => tracing::warn!(%error, "the API ended with a panic"),
+                Err(_) => tracing::warn!("the API did not finish in time"),
+            }
+        }
+        let (loops, io) = (self.loops, self.io);
+        let stopped = blocking(move || {
+            loops.stop();
+            if let Some(io) = io {
+                io.close();
+            }
+        });
+        if let Err(error) = stopped.await {
+            tracing::warn!(%error, "a room ended with a panic");
+        }
+        if let Err(error) = self.session.close().await {
+            tracing::warn!(%error, "the bus was not closed in order");
+        }
+    }
+}
+
+async fn blocking<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> Result<T, Error> {
+    tokio::task::spawn_blocking(work).await.map_err(|e| Error::start("a part of the host", e))
+}
