@@ -33,7 +33,6 @@ const EARLY_MAX: usize = 4096;
 const API_STOP_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// A host that runs.
-#[derive(Debug)]
 pub struct Running {
     /// Where the API listens.
     pub api: SocketAddr,
@@ -208,9 +207,7 @@ impl Running {
         if let Err(error) = stopped.await {
             tracing::warn!(%error, "a room ended with a panic");
         }
-        if let Err(error) = self.session.close().await {
-            tracing::warn!(%error, "the bus was not closed in order");
-        }
+        self.session.close().await;
     }
 }
 
