@@ -12,7 +12,7 @@ mod guest;
 #[test]
 fn ten_thousand_instances_come_and_go_without_growth() {
     // Both shapes of memory: slots, and allocation on demand.
-    for (instances_max, profile) in [(4, Profile::Pooled), (8001, Profile::OnDemand)] {
+    for (instances_max, profile) in [(4, Profile::Pooled), (14_001, Profile::OnDemand)] {
         let engine = engine_for(instances_max);
         assert_eq!(engine.profile(), profile);
         let law = engine.prepare(&Guest::good().build()).unwrap();

@@ -49,7 +49,7 @@ fn leftovers(dir: &tempfile::TempDir) -> usize {
 
 #[test]
 fn a_child_compiles_for_both_shapes_of_memory() {
-    for (instances_max, profile) in [(1, Profile::Pooled), (8001, Profile::OnDemand)] {
+    for (instances_max, profile) in [(1, Profile::Pooled), (14_001, Profile::OnDemand)] {
         let dir = tempfile::tempdir().unwrap();
         let engine = engine_with(&dir, instances_max, Limits::default(), this_binary()).unwrap();
         assert_eq!(engine.profile(), profile);

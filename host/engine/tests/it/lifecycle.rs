@@ -101,7 +101,7 @@ fn the_table_of_components_is_bounded() {
 
 #[test]
 fn a_thousand_instances_live_beside_each_other() {
-    for (instances_max, profile) in [(1000, Profile::Pooled), (9000, Profile::OnDemand)] {
+    for (instances_max, profile) in [(1000, Profile::Pooled), (14_001, Profile::OnDemand)] {
         let engine = engine_for(instances_max);
         assert_eq!(engine.profile(), profile);
         let law = engine.prepare(&Guest::good().build()).unwrap();
