@@ -1,5 +1,5 @@
 //! What the author of a controller uses: tables of ports and parameters, the [`Controller`] trait, the [`export!`] macro,
-//! control [`blocks`] and, on the author's own machine, a test [`bench`].
+//! control [`blocks`] and, on the author's own machine, a test [`mod@bench`].
 //!
 //! Owns the form of the state bytes ([`envelope`]): the SDK keeps the component's name, the layout and the parameter values
 //! in front of the law's own state, so that a step needs nothing else and a swap finds everything it may carry over.

@@ -208,7 +208,11 @@ impl Memory {
     pub const fn retune(&mut self, old: &Tuning, new: &Tuning) {
         let wanted = self.integral + self.rest(old);
         let has_derivative = new.td_s > 0.0 && new.gain != 0.0;
-        self.derivative = if has_derivative { self.derivative * (old.gain / new.gain) } else { 0.0 };
+        self.derivative = if has_derivative {
+            self.derivative * (old.gain / new.gain)
+        } else {
+            0.0
+        };
         self.integral = wanted - self.rest(new);
     }
 }
