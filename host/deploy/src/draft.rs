@@ -1,5 +1,6 @@
 //! A loop as people write it: TOML in a file, JSON over the API. Unknown keys are refused.
 //!
+//! It also travels to the loop's home in a form without field names, so no field is ever left out when it is written.
 //! Never: reaches for a component or a point; [`crate::Deploy::apply`] turns a draft into a checked specification.
 
 use std::collections::BTreeMap;
@@ -37,7 +38,7 @@ pub struct LoopDraft {
     /// Setpoint of the first start.
     pub setpoint: f64,
     /// Least and greatest setpoint; the measured point's range where not given.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(default)]
     pub setpoint_range: Option<(f64, f64)>,
     /// Mode of the first start.
     #[serde(default = "automatic")]
@@ -67,6 +68,6 @@ pub struct Change {
     #[serde(default)]
     pub parameters: BTreeMap<String, f64>,
     /// Another strategy.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(default)]
     pub strategy: Option<Strategy>,
 }

@@ -20,13 +20,20 @@ pub struct Words {
 impl Words {
     /// What is wrong, and what helps.
     pub fn new(reason: impl Into<String>, cure: impl Into<String>) -> Self {
-        Self { reason: reason.into(), cure: cure.into() }
+        Self {
+            reason: reason.into(),
+            cure: cure.into(),
+        }
     }
 }
 
 impl fmt::Display for Words {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        if self.cure.is_empty() { f.write_str(&self.reason) } else { write!(f, "{}; {}", self.reason, self.cure) }
+        if self.cure.is_empty() {
+            f.write_str(&self.reason)
+        } else {
+            write!(f, "{}; {}", self.reason, self.cure)
+        }
     }
 }
 

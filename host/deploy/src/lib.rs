@@ -1,14 +1,53 @@
 //! Joins what shall run with what runs: admission, library, distribution, reconciliation, requests between hosts.
+//!
+//! Owns: the library of components, the intents, who holds what, and the way of every change from a person's wish to the
+//! first record that shows it. It is async, and never on a cycle's thread.
+//! Never: steps a controller, writes an output, or decides who owns a loop; it tells the loops what they may use.
+//!
+//! ```text
+//! API ──► Deploy ──question──► the loop's home ──► plan ──► change / orders ──► loops ──► record ──► done
+//!            │                                                  │
+//!            └─ views ◄── book, library, roster, feed           └─► members: fetch, compile, hold
+//! ```
+//!
+//! A loop's *home* is the host that serves its points; it alone changes the loop's intent. Every host keeps a copy of all
+//! intents and components, so any host answers questions, and any control host can take any loop. The copies are kept alike
+//! by notices and, where those get lost, by comparing marks every second.
+//!
+//! Reading order: `draft`, `view`, `error` (what people see); `wire`, `field` (what this room speaks); `plan` (pure);
+//! `book`, `library`, `roster`, `feed` (what it keeps); `bench`, `holder`, `home`, `change`, `orders` (what it does);
+//! `sync`, `answers`, `service`, `room`, `deploy` (how it hangs together).
 
+mod answers;
+mod bench;
+mod book;
+mod change;
 mod deploy;
 mod error;
+mod feed;
+mod field;
+mod holder;
+mod home;
+mod library;
+mod orders;
+mod plan;
+mod room;
+mod roster;
+mod service;
+mod sync;
+mod uploads;
+mod wire;
 
 pub mod draft;
+pub mod limits;
 pub mod view;
 
 pub use deploy::Deploy;
 pub use draft::{Change, LoopDraft};
 pub use error::{Error, Words};
+pub use field::{CallSink, CommandSink, Field, WithdrawSink};
+pub use room::{DeployArrival, Parts};
 pub use view::{
-    ApplyEnd, Call, CallEnd, CommandEnd, ComponentView, Counters, HandOverView, HostView, LoopView, PointView,
+    ApplyEnd, Call, CallEnd, CommandEnd, ComponentView, Counters, FailureView, HandOverView, HostView, LoopView,
+    PointView,
 };

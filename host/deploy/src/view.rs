@@ -40,6 +40,19 @@ pub struct LoopView {
     pub members: Vec<HostId>,
     /// Counts; only the home has them.
     pub tally: Option<Tally>,
+    /// What this host could not do for the loop.
+    pub failures: Vec<FailureView>,
+}
+
+/// Something that this host shall do for a loop, could not, and tries again.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct FailureView {
+    /// The revision that it is about.
+    pub revision: u64,
+    /// What went wrong.
+    pub reason: String,
+    /// How often it was tried.
+    pub tries: u32,
 }
 
 /// A host as another sees it.
@@ -119,6 +132,8 @@ pub struct ApplyEnd {
     pub hand_over: Option<HandOverView>,
     /// Parameters of the old component that the new one does not have, or not with that value: left out of a swap.
     pub dropped_parameters: Vec<String>,
+    /// Input ports that the new component does not have: disconnected in a swap.
+    pub dropped_ports: Vec<String>,
 }
 
 /// How a state came over, as the committed record says.

@@ -1,0 +1,71 @@
+//! What this host answers when another, or it itself, asks.
+//!
+//! Never: forwards; a question for a loop's home that reaches another host is refused, and the asker looks again.
+
+use std::{pin::Pin, sync::Arc};
+
+use bumpless_core::HostId;
+
+use crate::{
+    book::on_disk,
+    error::Error,
+    limits::RECORDS_ASKED,
+    room::Room,
+    wire::{Ask, Told},
+};
+
+/// An answer on its way. Boxed, because a question may lead to further questions, to this host too.
+pub(crate) type Answer = Pin<Box<dyn Future<Output = Result<Told, Error>> + Send>>;
+
+impl Room {
+    /// Answers.
+    pub(crate) fn answer(self: Arc<Self>, from: HostId, ask: Ask) -> Answer {
+        Box::pin(async move {
+            match ask {
+                Ask::Apply(draft) => self.apply_here(from, *draft).await.map(Told::Applied),
+                Ask::Amend(id, amend) => self.amend_here(from, id, amend).await.map(Told::Applied),
+                Ask::Command(id, command) => self.command_here(&id, command).await.map(Told::Commanded),
+                Ask::Delete(id) => self.delete_here(id).await.map(|()| Told::Done),
+                Ask::Move(id, to) => self.move_here(&id, to).map(|()| Told::Done),
+                Ask::Try(spec) => self.try_here(&from, *spec).await,
+                Ask::Hold(intent, revision) => self.hold_here(&from, *intent, revision).await,
+                Ask::Held { came, went, afresh } => {
+                    let holds = self.homes.told(&from, came, &went, afresh);
+                    self.poke();
+                    Ok(Told::Holds(holds))
+                }
+                Ask::Find(points) => {
+                    let here = |point| self.io.as_ref().is_some_and(|io| io.index(point).is_some());
+                    Ok(Told::Found(points.iter().map(here).collect()))
+                }
+                Ask::Points(first) => Ok(self.points_here(first)),
+                Ask::Bytes(digest) => {
+                    let store = self.store.clone();
+                    let missing = || Error::not_found(format!("host {} does not have it", self.here), "");
+                    on_disk(move || store.component(&digest))
+                        .await??
+                        .map(Told::Bytes)
+                        .ok_or_else(missing)
+                }
+                Ask::Info(digest) => Ok(Told::Info(
+                    self.library.get(&digest).map(|info| Box::new((*info).clone())),
+                )),
+                Ask::Library => {
+                    let (components, removals) = self.library.heads();
+                    Ok(Told::Library(components, removals))
+                }
+                Ask::Intents => {
+                    let (heads, gone) = self.book.heads();
+                    Ok(Told::Intents(heads, gone))
+                }
+                Ask::Intent(id) => Ok(Told::Intent(
+                    self.book.get(&id).map(|intent| Box::new((*intent).clone())),
+                )),
+                Ask::Records(ids) => {
+                    let last = ids.iter().take(RECORDS_ASKED).filter_map(|id| self.feed.last(id));
+                    Ok(Told::Records(last.map(|last| (*last.record).clone()).collect()))
+                }
+            }
+        })
+    }
+}

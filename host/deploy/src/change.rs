@@ -1,0 +1,517 @@
+//! Changes of loops, at their home: create, change, and the way of a revision from proposal to its first record.
+//!
+//! ```text
+//! checked ──tried on members──► kept on disk ──held by members──► opened                              (new loop)
+//! checked ──proposed, on disk──► held by members ──Revise──► record says done ──► committed, on disk  (running loop)
+//!                     │                │                └─ refused ─┐
+//!                     └────────────────┴── not ready, no cycle ─────┴─► withdrawn: the old revision never left
+//! ```
+//! A change runs in a task of its own, so that an asker that goes away leaves nothing half done.
+
+use std::{sync::Arc, time::Duration};
+
+use bumpless_core::{Command, CommandBody, ComponentInfo, Event, HostId, Intent, LoopId, LoopSpec, Outcome, Record};
+use bumpless_loops::CommandReply;
+use futures_util::future::join_all;
+use tokio::{sync::oneshot, time::timeout};
+
+use crate::{
+    bench::stopping,
+    draft::LoopDraft,
+    error::{Error, Words, chain},
+    holder::wanted_members,
+    limits::{CHANGE_WAIT, COMMAND_WAIT_MIN, LOOPS_MAX, READY_WAIT},
+    plan::{self, Ground},
+    room::{Room, count},
+    view::{ApplyEnd, HandOverView},
+    wire::{Amend, Ask, Notice, Told},
+};
+
+/// What a swap leaves behind.
+#[derive(Debug, Default)]
+struct Dropped {
+    parameters: Vec<String>,
+    ports: Vec<String>,
+}
+
+/// How the members answered.
+struct Readiness {
+    ready: Vec<HostId>,
+    missing: Vec<(HostId, Error)>,
+}
+
+impl Readiness {
+    fn reasons(&self) -> String {
+        self.missing
+            .iter()
+            .map(|(host, error)| format!("{host}: {}", error.words()))
+            .collect::<Vec<_>>()
+            .join("; ")
+    }
+
+    /// The error where nobody can run it: what the component or the parameters did wrong is wrong everywhere, so its kind
+    /// counts before a host that is away.
+    fn failure(&self, what: &str, cure: &str) -> Error {
+        let words = Words::new(format!("{what} ({})", self.reasons()), cure);
+        let kinds = || self.missing.iter().map(|(_, error)| error);
+        if kinds().any(|e| matches!(e, Error::Invalid(_) | Error::Refused(_) | Error::NotFound(_))) {
+            Error::Refused(words)
+        } else if kinds().any(|e| matches!(e, Error::Busy(_))) {
+            Error::Busy(words)
+        } else if kinds().any(|e| matches!(e, Error::Timeout(_))) {
+            Error::Timeout(words)
+        } else {
+            Error::Unreachable(words)
+        }
+    }
+}
+
+/// How a command for a new revision ended.
+enum Revised {
+    Done(Arc<Record>),
+    Refused(String),
+    /// It was taken back before any cycle began with it.
+    TakenBack(Error),
+}
+
+impl Room {
+    /// Creates or changes a loop whose points are here.
+    pub(crate) async fn apply_here(self: &Arc<Self>, from: HostId, draft: LoopDraft) -> Result<ApplyEnd, Error> {
+        let id = plan::loop_id(&draft.name)?;
+        self.in_turn(id.clone(), move |room| async move {
+            let info = room.component(&draft.component, &from).await?;
+            match room.book.get(&id) {
+                None => room.create(&draft, &info).await,
+                Some(intent) => {
+                    let spec = plan::spec(
+                        &draft,
+                        info.digest,
+                        &info.descriptor,
+                        &room.ground(&|p| room.point_facts(p, &id)),
+                    )?;
+                    room.change(intent, spec, &info, Dropped::default()).await
+                }
+            }
+        })
+        .await
+    }
+
+    /// Changes a loop by a part.
+    pub(crate) async fn amend_here(
+        self: &Arc<Self>,
+        from: HostId,
+        id: LoopId,
+        amend: Amend,
+    ) -> Result<ApplyEnd, Error> {
+        self.in_turn(id.clone(), move |room| async move {
+            let intent = room.book.find(&id)?;
+            let current = &intent.current;
+            let (spec, dropped) = match amend {
+                Amend::Swap(reference) => {
+                    let info = room.component(&reference, &from).await?;
+                    let old = room.info_of(current.digest, Some(&from)).await.ok();
+                    let swapped = plan::swap(
+                        current,
+                        info.digest,
+                        old.as_ref().map(|i| &i.descriptor),
+                        &info.descriptor,
+                    );
+                    (
+                        swapped.spec,
+                        Dropped {
+                            parameters: swapped.parameters,
+                            ports: swapped.ports,
+                        },
+                    )
+                }
+                Amend::Set(change) => (plan::set(current, &change), Dropped::default()),
+                Amend::Rollback(revision) => {
+                    let earlier = match revision {
+                        Some(revision) => intent.find(revision),
+                        None => intent.previous(),
+                    };
+                    let spec = earlier.cloned().ok_or_else(|| {
+                        let known = intent
+                            .past
+                            .iter()
+                            .map(|s| s.revision.to_string())
+                            .collect::<Vec<_>>()
+                            .join(", ");
+                        let cure = if known.is_empty() {
+                            "it has none".to_owned()
+                        } else {
+                            format!("it has {known}")
+                        };
+                        Error::not_found(format!("loop {id} has no such revision to go back to"), cure)
+                    })?;
+                    (spec, Dropped::default())
+                }
+            };
+            let info = room.info_of(spec.digest, Some(&from)).await?;
+            let spec = plan::complete(spec, &info.descriptor, &room.ground(&|p| room.point_facts(p, &id)))?;
+            room.change(Arc::clone(&intent), spec, &info, dropped).await
+        })
+        .await
+    }
+
+    /// One change of a loop at a time, a few at a home, each in a task of its own.
+    async fn in_turn<F, W>(self: &Arc<Self>, id: LoopId, work: W) -> Result<ApplyEnd, Error>
+    where
+        F: Future<Output = Result<ApplyEnd, Error>> + Send + 'static,
+        W: FnOnce(Arc<Self>) -> F + Send + 'static,
+    {
+        let room = Arc::clone(self);
+        let (sender, receiver) = oneshot::channel();
+        self.spawn(async move {
+            let end = async {
+                let crowded = |_| {
+                    Error::busy(
+                        format!("other changes are under way at host {}", room.here),
+                        "try again",
+                    )
+                };
+                let _place = timeout(CHANGE_WAIT, room.changes.acquire())
+                    .await
+                    .map_err(crowded)?
+                    .map_err(|_| stopping())?;
+                let lock = room.homes.locks.of(&id);
+                let taken = |_| {
+                    Error::busy(
+                        format!("another change of loop {id} is under way"),
+                        "wait for its end, then try again",
+                    )
+                };
+                let _turn = timeout(CHANGE_WAIT, lock.lock()).await.map_err(taken)?;
+                work(Arc::clone(&room)).await
+            }
+            .await;
+            count(if end.is_ok() {
+                &room.tallies.applies
+            } else {
+                &room.tallies.applies_refused
+            });
+            room.poke();
+            // The asker may have gone.
+            let _ = sender.send(end);
+        });
+        receiver.await.map_err(|_| stopping())?
+    }
+
+    fn ground<'a>(&'a self, point: &'a dyn Fn(&bumpless_core::PointId) -> Option<plan::PointFacts>) -> Ground<'a> {
+        Ground {
+            home: &self.here,
+            point,
+        }
+    }
+
+    /// A component by reference; by digest also where only the asker has heard of it yet.
+    async fn component(self: &Arc<Self>, reference: &str, from: &HostId) -> Result<Arc<ComponentInfo>, Error> {
+        match reference.parse() {
+            Ok(digest) => self.info_of(digest, Some(from)).await,
+            Err(_) => self.library.resolve(reference),
+        }
+    }
+
+    async fn ask_members(self: &Arc<Self>, members: &[HostId], ask: &Ask) -> Readiness {
+        let answers = join_all(
+            members
+                .iter()
+                .map(|host| async move { (host.clone(), self.ask(host, ask.clone(), READY_WAIT).await) }),
+        );
+        let mut readiness = Readiness {
+            ready: Vec::new(),
+            missing: Vec::new(),
+        };
+        for (host, answer) in answers.await {
+            match answer {
+                Ok(_) => readiness.ready.push(host),
+                Err(error) => readiness.missing.push((host, error)),
+            }
+        }
+        readiness
+    }
+
+    async fn create(self: &Arc<Self>, draft: &LoopDraft, info: &ComponentInfo) -> Result<ApplyEnd, Error> {
+        let id = plan::loop_id(&draft.name)?;
+        let facts = |point: &_| self.point_facts(point, &id);
+        let spec = plan::spec(draft, info.digest, &info.descriptor, &self.ground(&facts))?;
+        if self.book.len() >= LOOPS_MAX {
+            return Err(Error::busy(
+                format!("the cell has {LOOPS_MAX} loops, the most it may have"),
+                "delete loops that are not needed",
+            ));
+        }
+        let members = bumpless_core::place::members(&id, &self.roster.eligible(), usize::from(spec.replicas));
+        if members.is_empty() {
+            return Err(nobody());
+        }
+        let tried = self.ask_members(&members, &Ask::Try(Box::new(spec.clone()))).await;
+        if tried.ready.is_empty() {
+            return Err(tried.failure(&format!("no host can run loop {id}"), "nothing was created"));
+        }
+        let intent = {
+            let _claim = self.homes.claims.lock().await;
+            // The outputs may have been claimed meanwhile.
+            let facts = |point: &_| self.point_facts(point, &id);
+            let spec = plan::complete(spec, &info.descriptor, &self.ground(&facts))?;
+            let after = self.book.last_removed(&id).await?;
+            let intent =
+                Intent::new(self.here.clone(), spec, after).map_err(|error| Error::refused(error.to_string(), ""))?;
+            self.publish(intent).await?
+        };
+        let revision = intent.current.revision;
+        // Those that are ready before the first cycle need not decline it; the others follow by themselves.
+        let held = self
+            .ask_members(&tried.ready, &Ask::Hold(Box::new((*intent).clone()), revision))
+            .await;
+        for host in held.ready {
+            self.homes.told(&host, vec![(id.clone(), revision)], &[], false);
+        }
+        if let Err(error) = self.open(&intent, None).await {
+            if let Some(tombstone) = self.book.remove(&id).await? {
+                self.announce(&Notice::Gone(tombstone));
+            }
+            return Err(error);
+        }
+        Ok(ApplyEnd {
+            id,
+            revision,
+            created: true,
+            unchanged: false,
+            hand_over: None,
+            dropped_parameters: Vec::new(),
+            dropped_ports: Vec::new(),
+        })
+    }
+
+    /// Brings a checked specification into force. The caller has the loop's lock.
+    async fn change(
+        self: &Arc<Self>,
+        intent: Arc<Intent>,
+        spec: LoopSpec,
+        info: &ComponentInfo,
+        dropped: Dropped,
+    ) -> Result<ApplyEnd, Error> {
+        let id = intent.loop_id.clone();
+        if intent.home != self.here {
+            let home = &intent.home;
+            return Err(Error::refused(
+                format!("loop {id} has its home at host {home}, not at {}", self.here),
+                "a loop's home cannot change; delete the loop and create it anew",
+            ));
+        }
+        if !self.homes.is_open(&id) {
+            return Err(Error::busy(
+                format!("loop {id} is not open at its home yet"),
+                "try again; its failures say what is in the way",
+            ));
+        }
+        if let Some(revision) = self.unsettled(&id) {
+            self.settle_locked(&id, revision).await?;
+        }
+        let current = &self.book.find(&id)?.current.clone();
+        let end = |revision, unchanged, hand_over| ApplyEnd {
+            id: id.clone(),
+            revision,
+            created: false,
+            unchanged,
+            hand_over,
+            dropped_parameters: dropped.parameters.clone(),
+            dropped_ports: dropped.ports.clone(),
+        };
+        if plan::same(current, &spec) {
+            return Ok(end(current.revision, true, None));
+        }
+        let eligible = self.roster.eligible();
+        if eligible.is_empty() {
+            return Err(nobody());
+        }
+        let (intent, revision) = {
+            let _claim = self.homes.claims.lock().await;
+            let facts = |point: &_| self.point_facts(point, &id);
+            let spec = plan::complete(spec, &info.descriptor, &self.ground(&facts))?;
+            let mut intent = (*self.book.find(&id)?).clone();
+            let revision = intent
+                .propose(spec)
+                .map_err(|error| Error::busy(error.to_string(), ""))?;
+            (self.publish(intent).await?, revision)
+        };
+        match self.bring_in(&intent, revision, &eligible).await {
+            Ok(Revised::Done(record)) => {
+                let mut intent = (*self.book.find(&id)?).clone();
+                intent
+                    .commit(revision)
+                    .map_err(|error| Error::internal(error.to_string()))?;
+                self.publish(intent).await?;
+                Ok(end(revision, false, hand_over(&record)))
+            }
+            Ok(Revised::Refused(reason)) => {
+                self.take_back(&id, revision).await?;
+                Err(Error::refused(
+                    format!("loop {id} did not go on with the change: {reason}"),
+                    "the old revision stays in force",
+                ))
+            }
+            Ok(Revised::TakenBack(error)) | Err(error) => {
+                self.take_back(&id, revision).await?;
+                Err(error)
+            }
+        }
+    }
+
+    async fn take_back(&self, id: &LoopId, revision: u64) -> Result<(), Error> {
+        let mut intent = (*self.book.find(id)?).clone();
+        intent
+            .withdraw(revision)
+            .map_err(|error| Error::internal(error.to_string()))?;
+        self.publish(intent).await.map(drop)
+    }
+
+    /// From proposal to the first record, or to the reason why there is none.
+    async fn bring_in(self: &Arc<Self>, intent: &Intent, revision: u64, eligible: &[HostId]) -> Result<Revised, Error> {
+        let id = &intent.loop_id;
+        let spec = intent
+            .find(revision)
+            .ok_or_else(|| Error::internal("a proposed revision is gone"))?;
+        let known = self.home_revision(spec).await?;
+        self.field
+            .add_home_revision(known)
+            .map_err(|error| Error::busy(chain(&error), ""))?;
+        let mut members = wanted_members(intent, eligible);
+        let owner = self.field.home_view(id).and_then(|view| view.owner);
+        if let Some(owner) = owner
+            .as_ref()
+            .filter(|owner| !members.contains(owner) && self.roster.there(owner))
+        {
+            members.push(owner.clone());
+        }
+        let readiness = self
+            .ask_members(&members, &Ask::Hold(Box::new(intent.clone()), revision))
+            .await;
+        for host in &readiness.ready {
+            self.homes.told(host, vec![(id.clone(), revision)], &[], false);
+        }
+        // All, or the one that must take it and one to stand by.
+        let owner_ready = owner
+            .as_ref()
+            .is_none_or(|owner| readiness.ready.contains(owner) || !self.roster.there(owner));
+        let enough = readiness.missing.is_empty() || (owner_ready && readiness.ready.len() >= 2);
+        if !enough {
+            return Err(readiness.failure(
+                &format!("the change of loop {id} is not ready where it must be"),
+                "the old revision stays in force",
+            ));
+        }
+        self.revise(id, revision, intent.current.period_ns).await
+    }
+
+    /// Asks the loop to go on with a revision, and waits until that is decided one way or the other.
+    async fn revise(&self, id: &LoopId, revision: u64, period_ns: u64) -> Result<Revised, Error> {
+        let command = Command {
+            id: self.new_command_id(),
+            body: CommandBody::Revise(revision),
+        };
+        let command_id = command.id;
+        let (sender, mut receiver) = oneshot::channel();
+        let reply = Box::new(move |reply| drop(sender.send(reply)));
+        self.field
+            .command(id, command, reply)
+            .map_err(|error| Error::busy(chain(&error), ""))?;
+        let period = Duration::from_nanos(period_ns);
+        let mut wait = COMMAND_WAIT_MIN.max(period * 3);
+        loop {
+            match timeout(wait, &mut receiver).await {
+                Ok(Ok(CommandReply::Applied { applied, record })) => {
+                    return Ok(match applied.outcome {
+                        Outcome::Done => Revised::Done(record),
+                        Outcome::Refused(reason) => Revised::Refused(reason),
+                    });
+                }
+                Ok(Ok(CommandReply::Full)) => {
+                    return Err(Error::busy(
+                        format!("too many commands wait for loop {id}"),
+                        "try again",
+                    ));
+                }
+                Ok(Ok(CommandReply::NoSuchLoop) | Err(_)) => {
+                    return Err(Error::busy(
+                        format!("loop {id} was closed at its home"),
+                        "look at the loop, then try again",
+                    ));
+                }
+                Err(_) => {
+                    if self.withdraw(id, command_id).await == Some(true) {
+                        return Ok(Revised::TakenBack(Error::timeout(
+                            format!("no cycle of loop {id} took the change within {} s", wait.as_secs_f32()),
+                            "the old revision stays in force; check that the loop has an owner",
+                        )));
+                    }
+                    // It rides in a sample that is out: the next record decides, or the next try to take it back.
+                    wait = period.max(Duration::from_millis(100));
+                }
+            }
+        }
+    }
+
+    /// Takes a command back. None where the loop does not say.
+    pub(crate) async fn withdraw(&self, id: &LoopId, command: bumpless_core::CommandId) -> Option<bool> {
+        let (sender, receiver) = oneshot::channel();
+        self.field
+            .withdraw(id, command, Box::new(move |taken| _ = sender.send(taken)))
+            .ok()?;
+        timeout(COMMAND_WAIT_MIN, receiver).await.ok()?.ok()
+    }
+
+    /// Could this host run it? Nothing stays.
+    pub(crate) async fn try_here(self: &Arc<Self>, from: &HostId, spec: LoopSpec) -> Result<Told, Error> {
+        self.made_ready(Arc::new(spec), Some(from)).await.map(|_| Told::Done)
+    }
+
+    /// Makes a revision ready here, and says when it is.
+    pub(crate) async fn hold_here(
+        self: &Arc<Self>,
+        from: &HostId,
+        intent: Intent,
+        revision: u64,
+    ) -> Result<Told, Error> {
+        let spec = intent
+            .find(revision)
+            .cloned()
+            .ok_or_else(|| Error::internal("the intent has no such revision"))?;
+        let home = intent.home.clone();
+        if home != *from || spec.id != intent.loop_id {
+            return Err(Error::refused(
+                format!("only the home of loop {} may ask for this", intent.loop_id),
+                "",
+            ));
+        }
+        if home != self.here {
+            self.book.keep(Arc::new(intent)).await?;
+        }
+        self.hold(&spec, &home).await.map(|()| Told::Done)
+    }
+}
+
+fn nobody() -> Error {
+    Error::unreachable(
+        "no host that runs controllers is there",
+        "start one, or wait until one is back",
+    )
+}
+
+/// How the state came over, as the record says.
+fn hand_over(record: &Record) -> Option<HandOverView> {
+    record.events.iter().find_map(|event| match event {
+        Event::Revised {
+            from_digest,
+            by,
+            bump_percent,
+            ..
+        } => Some(HandOverView {
+            by: by.clone(),
+            bump_percent: *bump_percent,
+            from_digest: *from_digest,
+        }),
+        _ => None,
+    })
+}

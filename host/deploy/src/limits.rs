@@ -1,0 +1,109 @@
+//! Every bound of deployment, with its unit and its reason.
+//!
+//! Never: a bound of the control protocol or of a third party; those stand in the core and in the rooms that own them.
+
+use std::time::Duration;
+
+/// Loops that one cell may have: each takes about 10 KB on every host, and a list of them still fits in one reply.
+pub const LOOPS_MAX: usize = 20_000;
+
+/// Components in the library: each is kept on every host.
+pub const COMPONENTS_MAX: usize = 1_000;
+
+/// Removed components that are remembered, so that a host that was away does not bring them back: 4 KB on disk.
+pub const REMOVALS_REMEMBERED_MAX: usize = 64;
+
+/// Components of the library that are compiled ahead of use, the newest first. The engine keeps 256; the rest is for
+/// loops that run older ones.
+pub const PREPARED_AHEAD_MAX: usize = 128;
+
+/// Uploads at once: each holds a component in memory, some of them twice.
+pub const UPLOADS_MAX: usize = 4;
+
+/// How long an upload waits for its turn.
+pub const UPLOAD_WAIT: Duration = Duration::from_secs(10);
+
+/// Changes of loops that one home works on at once: each asks every member for something.
+pub const CHANGES_MAX: usize = 16;
+
+/// How long a change waits for its turn.
+pub const CHANGE_WAIT: Duration = Duration::from_secs(10);
+
+/// Records that the live feed holds for a slow receiver; it then loses the oldest. 4,096 are some seconds of 1,000 loops.
+pub const FEED_RECORDS: usize = 4_096;
+
+/// Messages about changes that wait for their turn; more are dropped and counted, and the next comparison finds what they said.
+pub const NOTICES_WAITING_MAX: usize = 1_024;
+
+/// Notices worked on at once: each may wait for another host.
+pub const NOTICES_AT_ONCE: usize = 16;
+
+/// Shortest wait for a command's outcome. A loop slower than a third of this gets three periods.
+pub const COMMAND_WAIT_MIN: Duration = Duration::from_secs(5);
+
+/// Longest wait for a command's outcome: people and clients do not wait longer. The command goes on waiting for its cycle.
+pub const COMMAND_WAIT_MAX: Duration = Duration::from_secs(20);
+
+/// How much longer the asker of a command waits than the home does, so that the home's words arrive.
+pub const ANSWER_MARGIN: Duration = Duration::from_millis(500);
+
+/// Longest time of a change, as its asker sees it.
+pub const APPLY_WAIT: Duration = Duration::from_secs(60);
+
+/// How long the members may take to make a revision ready; a compilation that is under way may be ahead of it.
+pub const READY_WAIT: Duration = Duration::from_secs(20);
+
+/// How long a host may take for a short answer.
+pub const ANSWER_WAIT: Duration = Duration::from_secs(5);
+
+/// How long a host may take to send a component: 32 MiB over 10 Mbit/s.
+pub const FETCH_WAIT: Duration = Duration::from_secs(30);
+
+/// How long a home that starts looks for newer records at other hosts.
+pub const GATHER_WAIT: Duration = Duration::from_secs(1);
+
+/// Loops in one question for last records: 64 of the largest records fit in a reply.
+pub const RECORDS_ASKED: usize = 64;
+
+/// Points in one page of a list: 2 MB at worst.
+pub const POINTS_PER_PAGE: usize = 4_096;
+
+/// Entries of one report of held revisions.
+pub const HELD_PER_REPORT: usize = 4_096;
+
+/// How often what runs is compared with what shall run, without a reason.
+pub const RECONCILE_EVERY: Duration = Duration::from_secs(1);
+
+/// How often a host says how it is.
+pub const VITALS_EVERY: Duration = Duration::from_millis(200);
+
+/// Vitals older than this say nothing about now.
+pub const VITALS_FRESH: Duration = Duration::from_secs(2);
+
+/// How long a host that is no longer a member keeps its instances: another must be ready first, and a host that was only
+/// cut off for a moment comes back.
+pub const RELEASE_AFTER: Duration = Duration::from_secs(10);
+
+/// How long an owner that shall give a loop away stays a member while the loop moves, at most.
+pub const MOVE_WAIT: Duration = Duration::from_secs(5);
+
+/// Shortest and longest pause before something that failed is tried again.
+pub const BACK_OFF: (Duration, Duration) = (Duration::from_millis(500), Duration::from_secs(60));
+
+/// How long a stopping host waits until others have its loops.
+pub const DRAIN_WAIT: Duration = Duration::from_secs(2);
+
+/// How long a host that went is still shown.
+pub const GONE_SHOWN: Duration = Duration::from_secs(600);
+
+/// Hosts that are remembered, present or gone; the bus itself sends to no more.
+pub const HOSTS_MAX: usize = 4_096;
+
+/// Longest time of a first call on a new instance, in ns: its memory is touched for the first time.
+pub const WARM_LIMIT_NS: u64 = 100_000_000;
+
+/// Longest time of a step that was asked for from outside, in ns: as long as a loop's own step may take by default.
+pub const CALL_LIMIT_NS: u64 = 10_000_000;
+
+/// How long a call from outside may take in all.
+pub const CALL_WAIT: Duration = Duration::from_secs(5);

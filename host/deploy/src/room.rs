@@ -1,0 +1,502 @@
+//! What the parts of deployment share on one host, and the tasks that keep it going.
+//!
+//! ```text
+//! start ──► running: vitals every 200 ms, reconcile every second or when poked, notices as they come
+//!              │ shutdown: draining, others take over
+//!              ▼
+//!           stopped: tasks end, requests are refused
+//! ```
+//! Never: runs on a cycle's thread.
+
+use std::{
+    collections::{BTreeMap, HashMap, HashSet},
+    sync::{
+        Arc,
+        atomic::{AtomicBool, AtomicU64, Ordering},
+    },
+    time::{Duration, Instant, SystemTime, UNIX_EPOCH},
+};
+
+use bumpless_cell::{Arrival, Probe, Roles, Session, Vitals};
+use bumpless_core::{CommandId, Digest, HostId, LoopId};
+use bumpless_engine::Engine;
+use bumpless_io::{Clock, IoServer};
+use bumpless_loops::LoopsEvent;
+use bumpless_store::{RecordWriter, Store};
+use parking_lot::Mutex;
+use tokio::{
+    runtime::Handle,
+    sync::{Notify, Semaphore, mpsc, watch},
+    time::timeout,
+};
+
+use crate::{
+    bench::Bench,
+    book::Book,
+    error::{Error, Words, chain},
+    feed::Feed,
+    field::Field,
+    holder::Holder,
+    home::Homes,
+    library::Library,
+    limits::{CHANGES_MAX, NOTICES_WAITING_MAX, RECONCILE_EVERY, UPLOADS_MAX, VITALS_EVERY},
+    roster::Roster,
+    view::Counters,
+    wire::{self, Ask, Notice, Told},
+};
+
+/// What deployment works with. The composition root makes it.
+pub struct Parts {
+    /// The bus.
+    pub session: Session,
+    /// The disk.
+    pub store: Store,
+    /// Writes last records behind the cycle. Whoever made it closes it.
+    pub writer: Arc<RecordWriter>,
+    /// The sandbox. Every host has one, because every host takes uploads.
+    pub engine: Engine,
+    /// The points of this host, if it serves any.
+    pub io: Option<Arc<IoServer>>,
+    /// The host's steady clock.
+    pub clock: Clock,
+    /// The loops.
+    pub field: Arc<dyn Field>,
+    /// What this host offers the cell.
+    pub roles: Roles,
+    /// Where its API listens.
+    pub api: Option<String>,
+    /// Version of the program.
+    pub version: String,
+}
+
+/// What reaches deployment.
+#[derive(Debug)]
+pub enum DeployArrival {
+    /// From the bus: what the loops did not take.
+    Bus(Arrival),
+    /// From the loops.
+    Loops(LoopsEvent),
+}
+
+/// The comparisons of copies with other hosts.
+#[derive(Debug, Default)]
+pub(crate) struct Comparing {
+    /// Hosts that are being compared with now.
+    pub(crate) now: HashSet<HostId>,
+    /// The marks of both sides, joined, after the last whole comparison: the same again need not be compared.
+    pub(crate) done: BTreeMap<HostId, (u64, u64)>,
+}
+
+/// Counts that only grow.
+#[derive(Debug, Default)]
+pub(crate) struct Tallies {
+    pub(crate) uploads: AtomicU64,
+    pub(crate) uploads_refused: AtomicU64,
+    pub(crate) applies: AtomicU64,
+    pub(crate) applies_refused: AtomicU64,
+    pub(crate) fetches: AtomicU64,
+    pub(crate) fetches_failed: AtomicU64,
+    pub(crate) fetches_corrupt: AtomicU64,
+    pub(crate) prepares_failed: AtomicU64,
+    pub(crate) requests: AtomicU64,
+    pub(crate) malformed: AtomicU64,
+    pub(crate) arrivals_dropped: AtomicU64,
+}
+
+/// Adds one. Counts order nothing, so relaxed is enough.
+pub(crate) fn count(counter: &AtomicU64) {
+    counter.fetch_add(1, Ordering::Relaxed);
+}
+
+/// One lock per loop, made when it is wanted.
+#[derive(Debug, Default)]
+pub(crate) struct Locks(Mutex<HashMap<LoopId, Arc<tokio::sync::Mutex<()>>>>);
+
+impl Locks {
+    pub(crate) fn of(&self, id: &LoopId) -> Arc<tokio::sync::Mutex<()>> {
+        let mut locks = self.0.lock();
+        // Those that nobody has are forgotten, before there are many.
+        if locks.len() >= 1024 {
+            locks.retain(|_, lock| Arc::strong_count(lock) > 1);
+        }
+        Arc::clone(locks.entry(id.clone()).or_default())
+    }
+}
+
+/// Everything that deployment has on one host.
+pub(crate) struct Room {
+    pub(crate) here: HostId,
+    pub(crate) session: Session,
+    pub(crate) store: Store,
+    pub(crate) io: Option<Arc<IoServer>>,
+    pub(crate) clock: Clock,
+    pub(crate) field: Arc<dyn Field>,
+    pub(crate) book: Book,
+    pub(crate) library: Library,
+    pub(crate) bench: Bench,
+    pub(crate) roster: Roster,
+    pub(crate) feed: Feed,
+    pub(crate) holder: Holder,
+    pub(crate) homes: Homes,
+    pub(crate) tallies: Tallies,
+    pub(crate) uploads: Semaphore,
+    pub(crate) changes: Semaphore,
+    /// Held while an upload is let in, so that two of one name do not pass at once.
+    pub(crate) admission: tokio::sync::Mutex<()>,
+    pub(crate) comparing: Mutex<Comparing>,
+    own: Mutex<Vitals>,
+    draining: AtomicBool,
+    poke: Notify,
+    notices: mpsc::Sender<(HostId, Notice)>,
+    stop: watch::Sender<bool>,
+    runtime: Handle,
+    ids: AtomicU64,
+}
+
+impl Room {
+    /// Reads the disk, and starts the tasks on the runtime of the caller.
+    pub(crate) fn start(parts: Parts) -> Result<Arc<Self>, Error> {
+        let runtime = Handle::try_current().map_err(|error| Error::internal(error.to_string()))?;
+        let probe =
+            Probe::new().map_err(|error| Error::Internal(Words::new(chain(&error), "check that /proc is readable")))?;
+        let Parts {
+            session,
+            store,
+            writer,
+            engine,
+            io,
+            clock,
+            field,
+            roles,
+            api,
+            version,
+        } = parts;
+        let here = session.host().clone();
+        let own = Vitals {
+            host: here.clone(),
+            seq: 0,
+            started_at_ms: unix_ms(),
+            roles,
+            api,
+            cpu: 0.0,
+            cpu_process: 0.0,
+            memory_bytes: 0,
+            ready: Vec::new(),
+            loops_owned: 0,
+            loops_held: 0,
+            draining: false,
+            version,
+        };
+        let (notices, arrived) = mpsc::channel(NOTICES_WAITING_MAX);
+        let book = Book::open(store.clone())?;
+        let library = Library::open(store.clone())?;
+        let room = Arc::new(Self {
+            book,
+            library,
+            bench: Bench::new(engine),
+            roster: Roster::new(own.clone()),
+            feed: Feed::new(writer),
+            holder: Holder::default(),
+            homes: Homes::default(),
+            tallies: Tallies::default(),
+            uploads: Semaphore::new(UPLOADS_MAX),
+            changes: Semaphore::new(CHANGES_MAX),
+            admission: tokio::sync::Mutex::default(),
+            comparing: Mutex::default(),
+            own: Mutex::new(own),
+            draining: AtomicBool::new(false),
+            poke: Notify::new(),
+            notices,
+            stop: watch::Sender::new(false),
+            runtime,
+            ids: AtomicU64::new(0),
+            here,
+            session,
+            store,
+            io,
+            clock,
+            field,
+        });
+        for record in room.store.last_records()? {
+            room.feed.remember(&Arc::new(record));
+        }
+        for host in room.session.hosts() {
+            room.roster.up(&host);
+        }
+        room.spawn(Self::tell_vitals(Arc::clone(&room), probe));
+        room.spawn(Self::reconcile(Arc::clone(&room)));
+        room.spawn(Self::prepare_ahead(Arc::clone(&room)));
+        room.spawn(Self::hear_notices(Arc::clone(&room), arrived));
+        Ok(room)
+    }
+
+    /// Runs a task until it ends or the room stops.
+    pub(crate) fn spawn(&self, task: impl Future<Output = ()> + Send + 'static) {
+        let mut stop = self.stop.subscribe();
+        self.runtime.spawn(async move {
+            tokio::select! {
+                () = task => {}
+                _ = stop.wait_for(|stop| *stop) => {}
+            }
+        });
+    }
+
+    pub(crate) fn stop(&self) {
+        self.stop.send_replace(true);
+    }
+
+    pub(crate) fn stopped(&self) -> bool {
+        *self.stop.borrow()
+    }
+
+    /// Something changed: compare what runs with what shall run.
+    pub(crate) fn poke(&self) {
+        self.poke.notify_one();
+    }
+
+    /// Pokes later.
+    pub(crate) fn poke_in(self: &Arc<Self>, wait: Duration) {
+        let room = Arc::clone(self);
+        self.spawn(async move {
+            tokio::time::sleep(wait).await;
+            room.poke();
+        });
+    }
+
+    /// A name for a command that came without one: unique, because host, start and number are in it.
+    pub(crate) fn new_command_id(&self) -> CommandId {
+        let number = self.ids.fetch_add(1, Ordering::Relaxed);
+        let started_ms = self.own.lock().started_at_ms;
+        let text = format!("{} {started_ms} {number} {}", self.here, self.clock.now_ns());
+        let digest = Digest::of(text.as_bytes());
+        let first = digest.as_bytes().iter().take(16);
+        CommandId(first.fold(0, |id, byte| (id << 8) | u128::from(*byte)))
+    }
+
+    /// Asks a host, this one included, and waits for its answer.
+    pub(crate) async fn ask(self: &Arc<Self>, to: &HostId, ask: Ask, wait: Duration) -> Result<Told, Error> {
+        if *to == self.here {
+            return timeout(wait, Arc::clone(self).answer(self.here.clone(), ask))
+                .await
+                .map_err(|_| silent(to, wait))?;
+        }
+        let payload = wire::encode(&ask)?;
+        let reply = self
+            .session
+            .request(to, payload, wait)
+            .await
+            .map_err(|error| match error {
+                bumpless_cell::Error::Timeout { .. } => silent(to, wait),
+                bumpless_cell::Error::NoSuchHost { .. }
+                | bumpless_cell::Error::Closed { .. }
+                | bumpless_cell::Error::Send { .. } => {
+                    Error::unreachable(chain(&error), "start the host, or wait until it is back")
+                }
+                bumpless_cell::Error::Refused { .. } => Error::busy(chain(&error), "try again"),
+                other => Error::internal(chain(&other)),
+            })?;
+        wire::decode_reply(reply)
+    }
+
+    /// Tells all hosts. What is lost is found by the next comparison.
+    pub(crate) fn announce(&self, notice: &Notice) {
+        match wire::encode(notice) {
+            Ok(bytes) => self.session.publish_notice(&bytes),
+            Err(error) => tracing::warn!(%error, "a notice was not sent"),
+        }
+    }
+
+    /// Tells all hosts how far this one is, so that they compare.
+    pub(crate) fn announce_standing(&self) {
+        self.announce(&Notice::Standing {
+            library: self.library.mark(),
+            intents: self.book.mark(),
+        });
+    }
+
+    /// Takes what arrives. Never blocks.
+    pub(crate) fn arrive(self: &Arc<Self>, arrival: DeployArrival) {
+        match arrival {
+            DeployArrival::Loops(LoopsEvent::Record(record)) | DeployArrival::Bus(Arrival::Record(record)) => {
+                self.feed.pass(record);
+            }
+            // The record with it has passed before, or does now; the reconciliation reads it from there.
+            DeployArrival::Loops(LoopsEvent::Revised { loop_id, revision }) => {
+                self.homes.revised(&loop_id, revision);
+                self.poke();
+            }
+            DeployArrival::Bus(Arrival::HostUp(host)) => self.host_up(&host),
+            DeployArrival::Bus(Arrival::HostDown(host)) => self.host_down(&host),
+            DeployArrival::Bus(Arrival::Vitals(vitals)) => {
+                self.field.set_host(&vitals);
+                if self.roster.vitals(vitals) {
+                    self.poke();
+                }
+            }
+            DeployArrival::Bus(Arrival::Notice { from, payload }) => match wire::decode::<Notice>("notice", &payload) {
+                Ok(notice) => {
+                    if self.notices.try_send((from, notice)).is_err() {
+                        count(&self.tallies.arrivals_dropped);
+                    }
+                }
+                Err(error) => {
+                    count(&self.tallies.malformed);
+                    tracing::debug!(%from, %error, "a notice was passed over");
+                }
+            },
+            DeployArrival::Bus(Arrival::Request {
+                from,
+                payload,
+                responder,
+            }) => {
+                let room = Arc::clone(self);
+                // The bus lets only so many requests in at a time.
+                self.spawn(async move {
+                    let reply = match wire::decode::<Ask>("question", &payload) {
+                        Ok(ask) => {
+                            drop(payload);
+                            count(&room.tallies.requests);
+                            Arc::clone(&room).answer(from, ask).await
+                        }
+                        Err(error) => {
+                            count(&room.tallies.malformed);
+                            Err(error)
+                        }
+                    };
+                    responder.reply(wire::encode_reply(reply).map_err(|error| error.to_string()));
+                });
+            }
+            DeployArrival::Bus(other) => tracing::debug!(?other, "an arrival that is not for deployment"),
+        }
+    }
+
+    fn host_up(&self, host: &HostId) {
+        self.roster.up(host);
+        // A new life of a host knows nothing of what the old one was told.
+        self.holder.forget_reports_to(host);
+        self.homes.forget_host(host);
+        self.comparing.lock().done.remove(host);
+        self.announce_standing();
+        self.tell_vitals_now();
+        self.poke();
+    }
+
+    fn host_down(&self, host: &HostId) {
+        self.roster.down(host);
+        self.holder.forget_reports_to(host);
+        self.homes.forget_host(host);
+        self.poke();
+    }
+
+    async fn tell_vitals(room: Arc<Self>, mut probe: Probe) {
+        let mut tick = tokio::time::interval(VITALS_EVERY);
+        tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+        loop {
+            tick.tick().await;
+            let measured = probe.sample();
+            {
+                let mut own = room.own.lock();
+                own.cpu = measured.cpu;
+                own.cpu_process = measured.cpu_process;
+                own.memory_bytes = measured.memory_bytes;
+            }
+            room.tell_vitals_now();
+        }
+    }
+
+    pub(crate) fn tell_vitals_now(&self) {
+        let vitals = {
+            let mut own = self.own.lock();
+            own.seq += 1;
+            own.ready = self.bench.ready();
+            own.loops_owned = self.field.owned();
+            own.loops_held = u32::try_from(self.holder.len()).unwrap_or(u32::MAX);
+            own.draining = self.draining.load(Ordering::Acquire);
+            own.clone()
+        };
+        self.field.set_host(&vitals);
+        self.session.publish_vitals(&vitals);
+        if self.roster.vitals(vitals) {
+            self.poke();
+        }
+    }
+
+    /// Gives this host's loops away, or takes loops again.
+    pub(crate) fn set_draining(&self, draining: bool) {
+        self.draining.store(draining, Ordering::Release);
+        self.tell_vitals_now();
+        self.poke();
+    }
+
+    async fn reconcile(room: Arc<Self>) {
+        Self::gather_records(&room).await;
+        let mut tick = tokio::time::interval(RECONCILE_EVERY);
+        tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+        loop {
+            tokio::select! {
+                _ = tick.tick() => {
+                    for host in room.session.hosts() {
+                        if !room.roster.there(&host) && room.roster.up(&host) {
+                            room.poke();
+                        }
+                    }
+                    room.announce_standing();
+                    room.feed.prune(|id| room.book.get(id).is_some());
+                }
+                () = room.poke.notified() => {}
+            }
+            room.keep_homes().await;
+            room.keep_holds().await;
+        }
+    }
+
+    /// What this host counts.
+    pub(crate) fn counters(&self) -> Counters {
+        let now = Instant::now();
+        let get = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
+        let mut counters = Counters {
+            hosts_alive: self.roster.all().iter().filter(|(_, seen)| seen.alive(now)).count() as u64,
+            loops_known: self.book.len() as u64,
+            loops_held: self.holder.len() as u64,
+            loops_owned: u64::from(self.field.owned()),
+            components: self.library.len() as u64,
+            records: self.feed.count(),
+            uploads: get(&self.tallies.uploads),
+            uploads_refused: get(&self.tallies.uploads_refused),
+            applies: get(&self.tallies.applies),
+            applies_refused: get(&self.tallies.applies_refused),
+            fetches: get(&self.tallies.fetches),
+            fetches_failed: get(&self.tallies.fetches_failed),
+            fetches_corrupt: get(&self.tallies.fetches_corrupt),
+            prepares_failed: get(&self.tallies.prepares_failed),
+            requests: get(&self.tallies.requests),
+            malformed: get(&self.tallies.malformed),
+            arrivals_dropped: get(&self.tallies.arrivals_dropped),
+            ..Counters::default()
+        };
+        for intent in self.book.all().iter().filter(|intent| intent.home == self.here) {
+            counters.loops_home += 1;
+            if let Some(view) = self.field.home_view(&intent.loop_id) {
+                counters.cycles_taken += view.tally.taken;
+                counters.cycles_lost += view.tally.lost;
+                counters.cycles_skipped += view.tally.skipped;
+                counters.takeovers += view.tally.takeovers;
+                counters.commits_refused += view.tally.refused;
+            }
+        }
+        counters
+    }
+}
+
+fn silent(host: &HostId, wait: Duration) -> Error {
+    Error::timeout(
+        format!("host {host} did not answer within {} s", wait.as_secs_f32()),
+        "what was asked may still happen; look before you ask again",
+    )
+}
+
+/// Now, in ms of Unix time; a clock that was never set counts from 0.
+pub(crate) fn unix_ms() -> u64 {
+    let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    u64::try_from(since.as_millis()).unwrap_or(u64::MAX)
+}

@@ -1,0 +1,203 @@
+//! Who is there, and how they are.
+//!
+//! Owns: liveliness and the latest vitals of each host, this one included.
+//! Never: asks anybody. Liveliness alone decides who is there: vitals that are late say that a host is busy.
+//!
+//! ```text
+//! unknown ──up──► there ──vitals──► there, known ──down──► gone (shown for ten minutes) ──► unknown
+//! ```
+
+use std::{
+    collections::BTreeMap,
+    time::{Duration, Instant},
+};
+
+use bumpless_cell::Vitals;
+use bumpless_core::HostId;
+use parking_lot::Mutex;
+
+use crate::limits::{GONE_SHOWN, HOSTS_MAX, VITALS_FRESH};
+
+/// One host.
+#[derive(Debug, Clone)]
+pub(crate) struct Seen {
+    pub(crate) there: bool,
+    pub(crate) vitals: Option<Vitals>,
+    pub(crate) changed: Instant,
+}
+
+impl Seen {
+    /// There, and heard of lately.
+    pub(crate) fn alive(&self, now: Instant) -> bool {
+        self.there && self.vitals.is_some() && now.saturating_duration_since(self.changed) < VITALS_FRESH
+    }
+}
+
+/// All hosts.
+#[derive(Debug)]
+pub(crate) struct Roster {
+    here: HostId,
+    seen: Mutex<BTreeMap<HostId, Seen>>,
+}
+
+impl Roster {
+    /// This host alone.
+    pub(crate) fn new(own: Vitals) -> Self {
+        let here = own.host.clone();
+        let seen = Seen {
+            there: true,
+            vitals: Some(own),
+            changed: Instant::now(),
+        };
+        Self {
+            seen: Mutex::new(BTreeMap::from([(here.clone(), seen)])),
+            here,
+        }
+    }
+
+    fn change(&self, host: &HostId, edit: impl FnOnce(&mut Seen) -> bool) -> bool {
+        let mut seen = self.seen.lock();
+        let now = Instant::now();
+        if !seen.contains_key(host) {
+            seen.retain(|_, s| s.there || now.saturating_duration_since(s.changed) < GONE_SHOWN);
+            if seen.len() >= HOSTS_MAX {
+                return false;
+            }
+        }
+        let entry = seen.entry(host.clone()).or_insert(Seen {
+            there: false,
+            vitals: None,
+            changed: now,
+        });
+        entry.changed = now;
+        edit(entry)
+    }
+
+    /// A host came. Says whether that was news.
+    pub(crate) fn up(&self, host: &HostId) -> bool {
+        self.change(host, |seen| !std::mem::replace(&mut seen.there, true))
+    }
+
+    /// A host went. Says whether that was news.
+    pub(crate) fn down(&self, host: &HostId) -> bool {
+        *host != self.here && self.change(host, |seen| std::mem::replace(&mut seen.there, false))
+    }
+
+    /// How a host is. Says whether its part in placement changed.
+    pub(crate) fn vitals(&self, vitals: Vitals) -> bool {
+        let host = vitals.host.clone();
+        self.change(&host, |seen| {
+            // Of one process the later counts; of two the one that started later.
+            let order = |v: &Vitals| (v.started_at_ms, v.seq);
+            if seen.vitals.as_ref().is_some_and(|old| order(old) > order(&vitals)) {
+                return false;
+            }
+            let part = |v: &Vitals| (v.roles, v.draining);
+            let news = seen.vitals.as_ref().map(part) != Some(part(&vitals));
+            seen.vitals = Some(vitals);
+            news
+        })
+    }
+
+    /// Everyone that is shown, by name.
+    pub(crate) fn all(&self) -> Vec<(HostId, Seen)> {
+        self.seen.lock().iter().map(|(h, s)| (h.clone(), s.clone())).collect()
+    }
+
+    /// Is the host there?
+    pub(crate) fn there(&self, host: &HostId) -> bool {
+        self.seen.lock().get(host).is_some_and(|s| s.there)
+    }
+
+    /// Hosts that are there, other than this one.
+    pub(crate) fn others(&self) -> Vec<HostId> {
+        let seen = self.seen.lock();
+        seen.iter()
+            .filter(|(h, s)| s.there && **h != self.here)
+            .map(|(h, _)| h.clone())
+            .collect()
+    }
+
+    /// Hosts that serve points, this one included.
+    pub(crate) fn with_io(&self) -> Vec<HostId> {
+        self.filter(|v| v.roles.io)
+    }
+
+    /// Hosts that may hold loops: there, with the role, not being emptied. Where only hosts that are being emptied are
+    /// left, those: a loop that runs on a leaving host is better than one that does not run.
+    pub(crate) fn eligible(&self) -> Vec<HostId> {
+        let staying = self.filter(|v| v.roles.control && !v.draining);
+        if staying.is_empty() {
+            self.filter(|v| v.roles.control)
+        } else {
+            staying
+        }
+    }
+
+    fn filter(&self, wanted: impl Fn(&Vitals) -> bool) -> Vec<HostId> {
+        let seen = self.seen.lock();
+        let good = |s: &Seen| s.there && s.vitals.as_ref().is_some_and(&wanted);
+        seen.iter().filter(|(_, s)| good(s)).map(|(h, _)| h.clone()).collect()
+    }
+}
+
+/// Twice the pause for each failure, within bounds.
+pub(crate) fn back_off(tries: u32) -> Duration {
+    let (least, most) = crate::limits::BACK_OFF;
+    least.saturating_mul(1 << tries.saturating_sub(1).min(16)).min(most)
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "tests")]
+
+    use bumpless_cell::Roles;
+
+    use super::*;
+
+    fn vitals(host: &str, seq: u64, draining: bool) -> Vitals {
+        Vitals {
+            host: HostId::new(host).unwrap(),
+            seq,
+            started_at_ms: 1,
+            roles: Roles {
+                io: host == "io",
+                control: host != "io",
+            },
+            api: None,
+            cpu: 0.0,
+            cpu_process: 0.0,
+            memory_bytes: 0,
+            ready: vec![],
+            loops_owned: 0,
+            loops_held: 0,
+            draining,
+            version: String::new(),
+        }
+    }
+
+    #[test]
+    fn liveliness_decides_and_draining_hosts_are_the_last_resort() {
+        let name = |h: &str| HostId::new(h).unwrap();
+        let roster = Roster::new(vitals("io", 1, false));
+        assert_eq!((roster.with_io(), roster.eligible()), (vec![name("io")], vec![]));
+        roster.vitals(vitals("a", 1, false));
+        assert!(roster.eligible().is_empty(), "vitals alone do not make a host be there");
+        assert!(roster.up(&name("a")) && !roster.up(&name("a")));
+        assert!(roster.up(&name("b")) && roster.vitals(vitals("b", 5, false)));
+        assert_eq!(roster.eligible(), [name("a"), name("b")]);
+        assert!(roster.vitals(vitals("b", 6, true)), "draining is news");
+        assert!(!roster.vitals(vitals("b", 5, false)), "older vitals are not");
+        assert_eq!(roster.eligible(), [name("a")]);
+        assert!(roster.down(&name("a")) && !roster.down(&name("a")));
+        assert_eq!(roster.eligible(), [name("b")]);
+        assert!(!roster.down(&name("io")), "this host never goes");
+        assert_eq!(roster.others(), [name("b")]);
+    }
+
+    #[test]
+    fn pauses_double_up_to_a_minute() {
+        let ms: Vec<u128> = [1, 2, 3, 8, 40].map(|n| back_off(n).as_millis()).to_vec();
+        assert_eq!(ms, [500, 1_000, 2_000, 60_000, 60_000]);
+    }
+}

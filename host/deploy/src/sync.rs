@@ -1,0 +1,195 @@
+//! Keeps the copies of library and intents alike on all hosts.
+//!
+//! A notice says what changed, and is worked on at once. What got lost is found by comparing marks every second: where
+//! they differ, the lists are compared, and what is missing is fetched. Nothing depends on a notice arriving.
+//!
+//! ```text
+//! notice: intent x is at (7, 2) ──► is that news? ──► ask the teller for it ──► disk ──► reconcile
+//! notice: my marks are a, b ──────► differ from ours? ──► ask the teller for its lists ──► each entry as above
+//! ```
+//! Never: works on more than a few notices at once; those that wait beyond a bound are dropped.
+
+use std::sync::Arc;
+
+use bumpless_core::{Digest, HostId, LoopId};
+use tokio::sync::{Semaphore, mpsc};
+
+use crate::{
+    error::Error,
+    limits::{ANSWER_WAIT, LOOPS_MAX, NOTICES_AT_ONCE},
+    room::{Room, count},
+    wire::{Ask, Notice, Position, Told},
+};
+
+impl Room {
+    /// Works on notices until the room stops.
+    pub(crate) async fn hear_notices(room: Arc<Self>, mut notices: mpsc::Receiver<(HostId, Notice)>) {
+        let places = Arc::new(Semaphore::new(NOTICES_AT_ONCE));
+        while let Some((from, notice)) = notices.recv().await {
+            if !room.is_news(&from, &notice) {
+                continue;
+            }
+            let Ok(place) = Arc::clone(&places).acquire_owned().await else {
+                return;
+            };
+            let worker = Arc::clone(&room);
+            room.spawn(async move {
+                if let Err(error) = worker.hear(&from, notice).await {
+                    tracing::debug!(%from, %error, "a notice could not be followed; the next comparison finds it");
+                }
+                drop(place);
+            });
+        }
+    }
+
+    fn is_news(&self, from: &HostId, notice: &Notice) -> bool {
+        match notice {
+            Notice::Standing { library, intents } => {
+                let marks = (*library, *intents);
+                let ours = (self.library.mark(), self.book.mark());
+                let mut comparing = self.comparing.lock();
+                if marks == ours {
+                    comparing.done.remove(from);
+                    return false;
+                }
+                // Compared before with just these marks on both sides: what differs stays different, for example removals
+                // that only one of the two remembers.
+                let joined = (marks.0 ^ ours.0.rotate_left(1), marks.1 ^ ours.1.rotate_left(1));
+                comparing.done.get(from) != Some(&joined) && comparing.now.insert(from.clone())
+            }
+            Notice::Component(digest) => self.library.get(digest).is_none(),
+            Notice::ComponentGone(..) => true,
+            Notice::Intent(id, position) => self.book.wants(id, *position),
+            Notice::Gone(tombstone) => self.book.mourns(tombstone),
+        }
+    }
+
+    async fn hear(self: &Arc<Self>, from: &HostId, notice: Notice) -> Result<(), Error> {
+        match notice {
+            Notice::Standing { library, intents } => {
+                let compared = self.compare(from).await;
+                let ours = (self.library.mark(), self.book.mark());
+                let mut comparing = self.comparing.lock();
+                comparing.now.remove(from);
+                if compared.is_ok() {
+                    let joined = (library ^ ours.0.rotate_left(1), intents ^ ours.1.rotate_left(1));
+                    comparing.done.insert(from.clone(), joined);
+                }
+                compared
+            }
+            Notice::Component(digest) => self.copy_component(from, digest).await,
+            Notice::ComponentGone(digest, at_ms) => self.component_gone(digest, at_ms).await,
+            Notice::Intent(id, _) => self.copy_intent(from, id).await,
+            Notice::Gone(tombstone) => self.loop_gone(tombstone).await,
+        }
+    }
+
+    /// Compares everything with another host, and takes what is newer there. The first failure is given back, after all
+    /// else was tried.
+    async fn compare(self: &Arc<Self>, from: &HostId) -> Result<(), Error> {
+        let mut end = Ok(());
+        match self.ask(from, Ask::Library, ANSWER_WAIT).await {
+            Ok(Told::Library(components, removals)) => {
+                for (digest, at_ms) in removals {
+                    if self
+                        .library
+                        .get(&digest)
+                        .is_some_and(|info| info.uploaded_at_unix_ms <= at_ms)
+                    {
+                        end = end.and(self.component_gone(digest, at_ms).await);
+                    }
+                }
+                for (digest, uploaded_ms) in components {
+                    if self.library.wants(&digest, uploaded_ms) {
+                        end = end.and(self.copy_component(from, digest).await);
+                    }
+                }
+            }
+            Ok(_) => end = Err(Error::internal("the answer is no library")),
+            Err(error) => end = Err(error),
+        }
+        match self.ask(from, Ask::Intents, ANSWER_WAIT).await {
+            Ok(Told::Intents(heads, gone)) => {
+                for tombstone in gone {
+                    if self.book.mourns(&tombstone) {
+                        end = end.and(self.loop_gone(tombstone).await);
+                    }
+                }
+                for (id, position) in heads {
+                    if self.book.wants(&id, position) {
+                        end = end.and(self.copy_intent(from, id).await);
+                    }
+                }
+            }
+            Ok(_) => end = end.and(Err(Error::internal("the answer is no list of intents"))),
+            Err(error) => end = end.and(Err(error)),
+        }
+        end
+    }
+
+    async fn copy_component(self: &Arc<Self>, from: &HostId, digest: Digest) -> Result<(), Error> {
+        let Told::Info(Some(info)) = self.ask(from, Ask::Info(digest), ANSWER_WAIT).await? else {
+            return Ok(());
+        };
+        if info.digest != digest {
+            return Err(Error::internal("the answer is another component"));
+        }
+        info.check().map_err(|error| {
+            count(&self.tallies.malformed);
+            Error::invalid(format!("the summary of component {}: {error}", digest.short()), "")
+        })?;
+        if !self.library.wants(&digest, info.uploaded_at_unix_ms) {
+            return Ok(());
+        }
+        self.bytes_of(digest, Some(from)).await?;
+        self.library.keep(Arc::from(info), None).await?;
+        self.poke();
+        Ok(())
+    }
+
+    pub(crate) async fn component_gone(&self, digest: Digest, at_ms: u64) -> Result<(), Error> {
+        if self.library.remove(digest, at_ms).await? {
+            self.bench.forget(&digest);
+        }
+        Ok(())
+    }
+
+    async fn copy_intent(self: &Arc<Self>, from: &HostId, id: LoopId) -> Result<(), Error> {
+        let Told::Intent(Some(intent)) = self.ask(from, Ask::Intent(id.clone()), ANSWER_WAIT).await? else {
+            return Ok(());
+        };
+        if intent.loop_id != id || intent.revisions().any(|spec| spec.id != id || spec.check().is_err()) {
+            count(&self.tallies.malformed);
+            return Err(Error::internal("the answer is no intent of that loop"));
+        }
+        self.take_intent(*intent).await
+    }
+
+    /// Takes another host's copy of an intent. Of a loop whose home is here there is nothing newer elsewhere, except after
+    /// this host lost its disk.
+    async fn take_intent(self: &Arc<Self>, intent: bumpless_core::Intent) -> Result<(), Error> {
+        let position: Position = intent.position();
+        if !self.book.wants(&intent.loop_id, position) || self.book.len() >= LOOPS_MAX {
+            return Ok(());
+        }
+        if self.book.keep(Arc::new(intent)).await? {
+            self.poke();
+        }
+        Ok(())
+    }
+
+    async fn loop_gone(&self, tombstone: bumpless_store::Tombstone) -> Result<(), Error> {
+        let id = tombstone.loop_id.clone();
+        if self.book.bury(tombstone).await? {
+            if self.homes.is_open(&id) {
+                self.homes.closed(&id);
+                if let Err(error) = self.field.close_home(&id) {
+                    tracing::error!(loop_id = %id, %error, "a deleted loop could not be closed; restart this host");
+                }
+            }
+            self.gone(&id);
+            self.poke();
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,254 @@
+//! What hosts ask each other and tell each other: the form on the bus.
+//!
+//! Owns: the closed lists of questions, answers and notices, and their bytes: one version byte, then postcard. A
+//! component's bytes follow their own first bytes as they are, because they are large.
+//! Never: trusts what it reads; every value that matters is checked where it is used.
+
+use bumpless_core::{Command, ComponentInfo, Digest, HostId, Intent, LoopId, LoopSpec, PointId, Record};
+use bumpless_store::Tombstone;
+use serde::{Deserialize, Serialize, de::DeserializeOwned};
+
+use crate::{
+    draft::{Change, LoopDraft},
+    error::{Error, Words},
+    view::{ApplyEnd, CommandEnd, PointView},
+};
+
+/// Version of these lists. Another one is refused in words, so that a half updated cell says what is the matter.
+const VERSION: u8 = 1;
+
+/// A position of an intent among its copies: see [`Intent::position`].
+pub(crate) type Position = (u64, u64);
+
+/// What a host may be asked.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) enum Ask {
+    /// To the home: create or change a loop.
+    Apply(Box<LoopDraft>),
+    /// To the home: change a loop by a part.
+    Amend(LoopId, Amend),
+    /// To the home: an operator's command.
+    Command(LoopId, Command),
+    /// To the home: end the loop.
+    Delete(LoopId),
+    /// To the home: give the ownership to another member.
+    Move(LoopId, HostId),
+    /// To a member: could you run this? Nothing stays.
+    Try(Box<LoopSpec>),
+    /// To a member: make this revision of the intent ready, and say when it is.
+    Hold(Box<Intent>, u64),
+    /// To the home: these revisions can be stepped at the asker now, and those cannot any more. With `afresh`, what was told
+    /// before does not count.
+    Held {
+        /// Can be stepped.
+        came: Vec<(LoopId, u64)>,
+        /// Cannot any more.
+        went: Vec<(LoopId, u64)>,
+        /// Nothing before counts.
+        afresh: bool,
+    },
+    /// To an I/O host: which of these points do you serve?
+    Find(Vec<PointId>),
+    /// To an I/O host: your points, from this number on.
+    Points(u32),
+    /// A component's bytes.
+    Bytes(Digest),
+    /// A component's summary.
+    Info(Digest),
+    /// What the library holds.
+    Library,
+    /// How new each intent is.
+    Intents,
+    /// One intent.
+    Intent(LoopId),
+    /// The last records that the host has of these loops.
+    Records(Vec<LoopId>),
+}
+
+/// A change of a loop by a part.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) enum Amend {
+    /// Another component, by reference.
+    Swap(String),
+    /// Parameters or strategy.
+    Set(Change),
+    /// An earlier revision; the one before where none is named.
+    Rollback(Option<u64>),
+}
+
+/// What a host may answer.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) enum Told {
+    /// It is done.
+    Done,
+    /// How many revisions the home believes the asker to hold, after what it was told.
+    Holds(u64),
+    /// How a change ended.
+    Applied(ApplyEnd),
+    /// How a command ended.
+    Commanded(CommandEnd),
+    /// Which of the points are served there, in the order of the question.
+    Found(Vec<bool>),
+    /// A page of points, and how many there are in all.
+    Points(Vec<PointView>, u32),
+    /// A summary, if there is one.
+    Info(Option<Box<ComponentInfo>>),
+    /// Components with their upload times, and removals with theirs, in ms of Unix time.
+    Library(Vec<(Digest, u64)>, Vec<(Digest, u64)>),
+    /// How new each intent is, and which loops were removed.
+    Intents(Vec<(LoopId, Position)>, Vec<Tombstone>),
+    /// An intent, if there is one.
+    Intent(Option<Box<Intent>>),
+    /// Last records.
+    Records(Vec<Record>),
+    /// A component's bytes. Never written by serde: see [`encode_reply`].
+    #[serde(skip)]
+    Bytes(Vec<u8>),
+}
+
+/// What a host tells all others. A notice may be lost; `Standing`, repeated, finds what was missed.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) enum Notice {
+    /// Marks of the library and of the intents: where they differ, the lists are compared.
+    Standing {
+        /// Of the library.
+        library: u64,
+        /// Of the intents.
+        intents: u64,
+    },
+    /// A component came.
+    Component(Digest),
+    /// A component was removed, at this time in ms of Unix time.
+    ComponentGone(Digest, u64),
+    /// An intent is this new now.
+    Intent(LoopId, Position),
+    /// A loop was removed.
+    Gone(Tombstone),
+}
+
+/// A value with its version.
+pub(crate) fn encode<T: Serialize>(value: &T) -> Result<Vec<u8>, Error> {
+    postcard::to_extend(value, vec![VERSION])
+        .map_err(|error| Error::internal(format!("a message between hosts cannot be encoded: {error}")))
+}
+
+/// A value of this version.
+pub(crate) fn decode<T: DeserializeOwned>(what: &str, bytes: &[u8]) -> Result<T, Error> {
+    let bad = |reason: String| {
+        Error::Internal(Words::new(
+            format!("a {what} cannot be read: {reason}"),
+            "update the older host",
+        ))
+    };
+    match bytes.split_first() {
+        Some((&VERSION, rest)) => match postcard::take_from_bytes(rest) {
+            Ok((value, [])) => Ok(value),
+            Ok((_, left)) => Err(bad(format!("{} bytes are left over", left.len()))),
+            Err(error) => Err(bad(error.to_string())),
+        },
+        Some((found, _)) => Err(bad(format!(
+            "it has version {found}, this host speaks version {VERSION}"
+        ))),
+        None => Err(bad("it is empty".to_owned())),
+    }
+}
+
+/// Last byte of a reply that is a component's bytes; no version ever gets this number.
+const RAW: u8 = 0xff;
+
+/// A reply; its kind stands at the end, so that a component's bytes need not be moved for it.
+pub(crate) fn encode_reply(reply: Result<Told, Error>) -> Result<Vec<u8>, Error> {
+    match reply {
+        Ok(Told::Bytes(mut bytes)) => {
+            bytes.push(RAW);
+            Ok(bytes)
+        }
+        reply => {
+            let mut bytes = encode(&reply)?;
+            bytes.push(VERSION);
+            Ok(bytes)
+        }
+    }
+}
+
+/// A reply.
+pub(crate) fn decode_reply(mut bytes: Vec<u8>) -> Result<Told, Error> {
+    match bytes.pop() {
+        Some(RAW) => Ok(Told::Bytes(bytes)),
+        Some(VERSION) => decode::<Result<Told, Error>>("reply", &bytes)?,
+        _ => Err(Error::Internal(Words::new(
+            "a reply cannot be read: its end is unknown",
+            "update the older host",
+        ))),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, clippy::expect_used, reason = "tests")]
+
+    use std::collections::BTreeMap;
+
+    use bumpless_core::{Mode, OutputLimit, Policy, Strategy};
+
+    use super::*;
+
+    #[test]
+    fn everything_comes_back_as_it_went() {
+        let draft = LoopDraft {
+            name: "l".into(),
+            component: "pid".into(),
+            period_ms: 10.0,
+            ports: BTreeMap::from([("pv".into(), "plant.pit129".into())]),
+            parameters: BTreeMap::new(),
+            setpoint: 1.0,
+            setpoint_range: None,
+            mode: Mode::Automatic,
+            strategy: Strategy::RoundRobin,
+            replicas: 3,
+            // A limit without a rate, between others: nothing may be left out.
+            limits: BTreeMap::from([(
+                "out".into(),
+                OutputLimit {
+                    low: 0.0,
+                    high: 1.0,
+                    rate_per_s: None,
+                    safe: 0.0,
+                },
+            )]),
+            listens: vec![],
+            policy: Policy::default(),
+        };
+        for ask in [Ask::Apply(Box::new(draft)), Ask::Library, Ask::Points(7)] {
+            assert_eq!(decode::<Ask>("question", &encode(&ask).unwrap()).unwrap(), ask);
+        }
+        let refusal = Err(Error::refused("a", "b"));
+        for reply in [
+            Ok(Told::Done),
+            Ok(Told::Found(vec![true])),
+            Ok(Told::Bytes(vec![1, 2])),
+            Ok(Told::Bytes(vec![])),
+            refusal,
+        ] {
+            assert_eq!(decode_reply(encode_reply(reply.clone()).unwrap()), reply);
+        }
+    }
+
+    #[test]
+    fn other_versions_and_other_bytes_are_refused_in_words() {
+        let good = encode(&Ask::Library).unwrap();
+        let longer = [good.clone(), vec![0]].concat();
+        for (bytes, part) in [
+            (vec![], "it is empty"),
+            (vec![9, 0], "version 9"),
+            (vec![VERSION], "cannot be read"),
+            (vec![VERSION, 200], "cannot be read"),
+            (longer, "left over"),
+        ] {
+            let error = decode::<Ask>("question", &bytes).expect_err(part).to_string();
+            assert!(error.contains(part), "{part}: {error}");
+        }
+        assert!(decode_reply(vec![]).is_err());
+        assert!(decode_reply(vec![VERSION]).is_err());
+    }
+}
