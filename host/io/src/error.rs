@@ -40,7 +40,10 @@ pub enum Error {
         value: String,
     },
     /// A write outside the point's range.
-    #[error("point {point}: {value} {unit} is outside {low} to {high}; nothing was written")]
+    #[error(
+        "point {point}: {value}{} is outside {low} to {high}; nothing was written",
+        after_space(unit)
+    )]
     OutOfRange {
         /// The point.
         point: PointId,
@@ -56,6 +59,15 @@ pub enum Error {
     /// A write after the end.
     #[error("the I/O of this host is closed; nothing was written")]
     Closed,
+}
+
+/// The unit behind its number; nothing where there is none.
+fn after_space(unit: &str) -> String {
+    if unit.is_empty() {
+        String::new()
+    } else {
+        format!(" {unit}")
+    }
 }
 
 impl Error {

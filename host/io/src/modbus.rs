@@ -43,6 +43,7 @@ mod backoff;
 pub(crate) mod driver;
 mod link;
 mod outbox;
+mod wire;
 
 use bumpless_core::{BusId, PointId, PortKind};
 use serde::{Deserialize, Serialize};

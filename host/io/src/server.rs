@@ -128,9 +128,8 @@ impl IoServer {
                 ));
             }
             let (bus, infos) = match bus {
-                BusConfig::Sim(sim) => {
-                    SimDriver::open(sim, clock.now_ns()).map(|(driver, infos)| (Prepared::Sim(Box::new(driver)), infos))?
-                }
+                BusConfig::Sim(sim) => SimDriver::open(sim, clock.now_ns())
+                    .map(|(driver, infos)| (Prepared::Sim(Box::new(driver)), infos))?,
                 BusConfig::ModbusTcp(modbus) => modbus
                     .plan()
                     .map(|(plan, infos)| (Prepared::Modbus(Box::new(plan)), infos))?,

@@ -29,8 +29,9 @@ use super::{
     WriteWith,
     backoff::Backoff,
     driver::Shared,
-    group::{Group, Table},
+    group::{Group, Item, Table},
     outbox::{Wish, encoded},
+    wire::Wire,
 };
 use crate::{
     config::OnStop,
@@ -105,9 +106,12 @@ impl Link {
         while !self.stopping() {
             if let Some(mut context) = self.connect().await {
                 let end = self.serve(&mut context).await;
-                self.shared.status.update(|s| s.connected = false);
-                if matches!(end, End::Stopped) {
+                let stopped = matches!(end, End::Stopped);
+                if stopped {
                     self.last_writes(&mut context).await;
+                }
+                self.shared.status.update(|s| s.connected = false);
+                if stopped {
                     // The device sees an orderly end; one that does not care is left to the system.
                     let _ = timeout(self.time_limit(), context.disconnect()).await;
                     return;
@@ -141,7 +145,7 @@ impl Link {
                 self.shared.outbox.forget();
                 self.shared.status.update(|s| s.connections += 1);
                 tracing::info!(bus = %self.shared.plan.bus, address, "connected");
-                return Some(tcp::attach(stream));
+                return Some(tcp::attach(Wire(stream)));
             }
             Ok(Err(error)) => error.to_string(),
             Err(_) => format!("no connection within {} ms", self.shared.plan.timeout_ms),
@@ -274,41 +278,45 @@ impl Link {
 
     /// Puts an answer into the image; false where it does not hold what was asked for.
     fn take(&self, group: &Group, response: &Response, at_ns: u64) -> bool {
-        let decoded: Vec<Option<f64>> = match (group.table, response) {
+        // Registers of each point, and a bit as one register.
+        let mut taken: Vec<(&Item, Vec<u16>)> = Vec::with_capacity(group.items.len());
+        match (group.table, response) {
             (Table::Coil, Response::ReadCoils(bits)) | (Table::Discrete, Response::ReadDiscreteInputs(bits)) => {
-                let bit = |start: u16| {
-                    bits.get(usize::from(start - group.start))
-                        .map(|on| f64::from(u8::from(*on)))
-                };
-                group.items.iter().map(|item| bit(item.start)).collect()
+                for item in &group.items {
+                    let Some(on) = bits.get(usize::from(item.start - group.start)) else {
+                        return false;
+                    };
+                    taken.push((item, vec![u16::from(*on)]));
+                }
             }
             (Table::Holding, Response::ReadHoldingRegisters(words))
             | (Table::Input, Response::ReadInputRegisters(words)) => {
                 if words.len() != usize::from(group.count) {
                     return false;
                 }
-                let number = |item: &super::group::Item| {
-                    let point = self.shared.plan.points.get(item.point)?;
-                    let words = words.get(usize::from(item.start - group.start)..)?;
-                    point.value_type.decode(words, point.word_order, point.byte_order)
-                };
-                group.items.iter().map(number).collect()
+                for item in &group.items {
+                    let start = usize::from(item.start - group.start);
+                    let Some(own) = words.get(start..start + usize::from(item.count)) else {
+                        return false;
+                    };
+                    taken.push((item, own.to_vec()));
+                }
             }
             _ => return false,
-        };
-        if decoded.iter().any(Option::is_none) {
-            return false;
         }
-        for (item, raw) in group.items.iter().zip(decoded) {
-            self.show(item.point, raw.unwrap_or_default(), at_ns);
+        for (item, words) in taken {
+            self.shared.outbox.seen(item.point, &words);
+            self.show(item.point, &words, at_ns);
         }
         true
     }
 
-    /// Puts one raw number into the image.
-    fn show(&self, point: usize, raw: f64, at_ns: u64) {
-        if let Some(planned) = self.shared.plan.points.get(point) {
-            let (value, quality) = planned.scaling.reading(raw);
+    /// Puts the registers of one point into the image.
+    fn show(&self, point: usize, words: &[u16], at_ns: u64) {
+        if let Some(p) = self.shared.plan.points.get(point)
+            && let Some(raw) = p.value_type.decode(words, p.word_order, p.byte_order)
+        {
+            let (value, quality) = p.scaling.reading(raw);
             self.shared.image.set(point, value, quality, at_ns);
         }
     }
@@ -337,11 +345,7 @@ impl Link {
                     self.answered(unit_id);
                     for wish in &batch {
                         self.shared.outbox.sent(wish, now_ns);
-                        if let Some(p) = self.shared.plan.points.get(wish.point)
-                            && let Some(raw) = p.value_type.decode(wish.words.as_slice(), p.word_order, p.byte_order)
-                        {
-                            self.show(wish.point, raw, now_ns);
-                        }
+                        self.show(wish.point, wish.words.as_slice(), now_ns);
                     }
                     self.shared.status.update(|s| s.writes += batch.len() as u64);
                 }
@@ -450,9 +454,6 @@ impl Link {
         match answer {
             Ok(Ok(Ok(response))) => Ok(response),
             Ok(Ok(Err(exception))) => Err(Failure::Exception(exception.into())),
-            Ok(Err(tokio_modbus::Error::Transport(error))) if error.raw_os_error() == Some(0) => {
-                Err(Failure::Lost("the device closed the connection".to_owned()))
-            }
             Ok(Err(error)) => Err(Failure::Lost(error.to_string())),
             Err(_) => Err(Failure::TimedOut),
         }

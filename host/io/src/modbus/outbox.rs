@@ -107,6 +107,16 @@ impl Outbox {
         }
     }
 
+    /// The device was read. Where it holds something else than was written (it started again, obeyed an old request late,
+    /// or somebody turned a knob), the next write of the loop is sent even if its value is the same.
+    pub(crate) fn seen(&self, point: usize, words: &[u16]) {
+        if let Some(slot) = self.inside.lock().slots.get_mut(point)
+            && slot.known.is_some_and(|(known, _)| known.as_slice() != words)
+        {
+            slot.known = None;
+        }
+    }
+
     /// The write did not arrive: it waits again, unless a newer one does.
     pub(crate) fn put_back(&self, wish: &Wish) {
         let mut guard = self.inside.lock();
@@ -203,6 +213,13 @@ mod tests {
         outbox.put(wish(0, 1.0, 101));
         assert!(outbox.is_waiting());
         outbox.sent(&outbox.take(101).0[0], 101);
+        outbox.seen(0, &[1]);
+        outbox.put(wish(0, 1.0, 102));
+        assert!(!outbox.is_waiting());
+        outbox.seen(0, &[4]);
+        outbox.put(wish(0, 1.0, 102));
+        assert_eq!(outbox.take(102).0, [wish(0, 1.0, 102)]);
+        outbox.sent(&wish(0, 1.0, 102), 102);
         outbox.forget();
         outbox.put(wish(0, 1.0, 102));
         assert!(outbox.is_waiting());

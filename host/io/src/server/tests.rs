@@ -1,6 +1,6 @@
 //! The server with simulated buses, and what it says of bad configurations and bad writes.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, reason = "tests")]
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "tests")]
 
 use bumpless_core::{NoData, Quality};
 
@@ -453,5 +453,41 @@ fn text_that_is_no_configuration_is_refused_by_its_keys() {
     for (text, part) in cases {
         let error = toml::from_str::<Config>(text).expect_err(text).to_string();
         assert!(error.contains(part), "{text}\nsays {error}");
+    }
+}
+
+#[test]
+fn configurations_that_are_shown_to_people_work() {
+    // The rustdoc of a module, without its comment marks, from one fence to the next.
+    let shown = |source: &str| -> Vec<String> {
+        let text: String = source
+            .lines()
+            .filter_map(|line| {
+                line.trim_start()
+                    .strip_prefix("//!")
+                    .or(line.trim_start().strip_prefix("///"))
+            })
+            .map(|line| format!("{}\n", line.strip_prefix(' ').unwrap_or(line)))
+            .collect();
+        text.split("```toml\n")
+            .skip(1)
+            .filter_map(|rest| rest.split("```").next().map(str::to_owned))
+            .collect()
+    };
+    let folder = tempfile::tempdir().unwrap();
+    let journal = folder.path().join("writes.csv");
+    let mut texts = vec![include_str!("../../../../examples/modbus-plant/host.toml").to_owned()];
+    for source in [
+        include_str!("../config.rs"),
+        include_str!("../sim.rs"),
+        include_str!("../modbus.rs"),
+    ] {
+        texts.extend(shown(source));
+    }
+    assert_eq!(texts.len(), 5);
+    for text in texts {
+        let text = text.replace("\"writes.csv\"", &format!("{journal:?}"));
+        let server = open(&text).unwrap_or_else(|error| panic!("{text}\n{error}"));
+        assert!(!server.points().is_empty());
     }
 }
