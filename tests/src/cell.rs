@@ -1,0 +1,279 @@
+//! A cell on this machine: one host with the simulated plant, and controller hosts `a`, `b`, `c`…
+
+use std::{path::Path, time::Duration};
+
+use serde_json::{Value, json};
+use tempfile::TempDir;
+
+use crate::{Api, Error, HostOptions, HostProcess, Journal, wait_until};
+
+/// Name of the host with the plant.
+pub const PLANT: &str = "plant";
+
+/// Longest time until all hosts of a new cell see each other.
+const JOIN_MAX: Duration = Duration::from_secs(30);
+
+/// The simulated pilot plant with a journal.
+const PILOT_PLANT: &str = "[[bus]]\nid = \"plant\"\ndriver = \"sim\"\nseed = 7\njournal = \"{folder}/writes.csv\"\n";
+
+/// What a cell is made of.
+#[derive(Debug, Clone)]
+pub struct CellOptions {
+    /// Controller hosts, at most 26: `a`, `b`, `c`…
+    pub controllers: usize,
+    /// The `[[bus]]` tables of the plant host, as TOML; `{folder}` stands for its folder. For [`Cell::journal`] the
+    /// simulated bus must have `journal = "{folder}/writes.csv"`.
+    pub bus: String,
+    /// Tables besides of the plant host, as TOML.
+    pub plant_tables: String,
+    /// Tables besides of each controller host, as TOML.
+    pub controller_tables: String,
+    /// Keys besides of every host's `[cell]` table, as TOML lines.
+    pub cell_extra: String,
+    /// Words before the command of a host, by host name.
+    pub launchers: Vec<(String, Vec<String>)>,
+}
+
+impl Default for CellOptions {
+    /// Three controllers and the pilot plant with a journal.
+    fn default() -> Self {
+        Self {
+            controllers: 3,
+            bus: PILOT_PLANT.to_owned(),
+            plant_tables: String::new(),
+            controller_tables: String::new(),
+            cell_extra: String::new(),
+            launchers: Vec::new(),
+        }
+    }
+}
+
+impl CellOptions {
+    /// Three controllers and a row of first-order loops with a journal: points `plant.0.pv`, `plant.0.out`…
+    #[must_use]
+    pub fn first_order(fopdt: &str) -> Self {
+        Self {
+            bus: format!(
+                "[[bus]]\nid = \"plant\"\ndriver = \"sim\"\nseed = 7\njournal = \"{{folder}}/writes.csv\"\nfopdt = {fopdt}\n"
+            ),
+            ..Self::default()
+        }
+    }
+
+    /// With another number of controllers.
+    #[must_use]
+    pub const fn controllers(mut self, controllers: usize) -> Self {
+        self.controllers = controllers;
+        self
+    }
+}
+
+/// A running cell. Its hosts end with it.
+#[derive(Debug)]
+pub struct Cell {
+    /// The host with the plant.
+    pub plant: HostProcess,
+    /// The controller hosts.
+    pub controllers: Vec<HostProcess>,
+    /// The cell's name.
+    pub name: String,
+    options: CellOptions,
+    // Last, so that it is removed when nobody writes into it any more.
+    folder: TempDir,
+}
+
+impl Cell {
+    /// Starts all hosts and waits until each sees all the others.
+    ///
+    /// # Errors
+    /// Where a host does not start, or they do not find each other in 30 s.
+    pub fn start(options: CellOptions) -> Result<Self, Error> {
+        let folder = tempfile::Builder::new()
+            .prefix("bumpless-")
+            .tempdir()
+            .map_err(|source| Error::File {
+                path: std::env::temp_dir(),
+                action: "written",
+                source,
+            })?;
+        let name = format!("t-{:016x}", random());
+        let plant_options = HostOptions {
+            name: PLANT.to_owned(),
+            cell: name.clone(),
+            tables: format!("{}\n{}", options.bus, options.plant_tables),
+            cell_extra: options.cell_extra.clone(),
+            launcher: launcher(&options, PLANT),
+            ..HostOptions::default()
+        };
+        let plant = HostProcess::start(plant_options, &folder.path().join(PLANT))?;
+        let mut cell = Self {
+            plant,
+            controllers: Vec::new(),
+            name,
+            options,
+            folder,
+        };
+        for n in 0..cell.options.controllers {
+            let host = cell.spawn_controller(&controller_name(n))?;
+            cell.controllers.push(host);
+        }
+        for host in &mut cell.controllers {
+            host.wait_ready()?;
+        }
+        cell.wait_joined()?;
+        Ok(cell)
+    }
+
+    fn spawn_controller(&self, name: &str) -> Result<HostProcess, Error> {
+        let options = HostOptions {
+            name: name.to_owned(),
+            cell: self.name.clone(),
+            connect: self.locators(name),
+            tables: self.options.controller_tables.clone(),
+            cell_extra: self.options.cell_extra.clone(),
+            launcher: launcher(&self.options, name),
+            ..HostOptions::default()
+        };
+        HostProcess::spawn(options, &self.folder.path().join(name))
+    }
+
+    /// Starts one more controller host and waits until all hosts see it.
+    ///
+    /// # Errors
+    /// As [`Cell::start`].
+    pub fn add_controller(&mut self, name: &str) -> Result<(), Error> {
+        let mut host = self.spawn_controller(name)?;
+        host.wait_ready()?;
+        self.controllers.push(host);
+        self.wait_joined()
+    }
+
+    /// Where the hosts other than `but` listen.
+    fn locators(&self, but: &str) -> Vec<String> {
+        self.hosts()
+            .filter(|host| host.name != but)
+            .flat_map(|host| host.cell.iter().cloned())
+            .collect()
+    }
+
+    /// All hosts, the plant first.
+    pub fn hosts(&self) -> impl Iterator<Item = &HostProcess> {
+        std::iter::once(&self.plant).chain(&self.controllers)
+    }
+
+    /// All hosts, the plant first.
+    pub fn hosts_mut(&mut self) -> impl Iterator<Item = &mut HostProcess> {
+        std::iter::once(&mut self.plant).chain(&mut self.controllers)
+    }
+
+    /// A host by name.
+    ///
+    /// # Errors
+    /// [`Error::NoHost`].
+    pub fn host(&mut self, name: &str) -> Result<&mut HostProcess, Error> {
+        let missing = || Error::NoHost(format!("the cell has no host {name:?}"));
+        self.hosts_mut().find(|host| host.name == name).ok_or_else(missing)
+    }
+
+    /// Starts a host again where it was, knowing all others.
+    ///
+    /// # Errors
+    /// As [`HostProcess::restart`].
+    pub fn restart(&mut self, name: &str) -> Result<(), Error> {
+        let connect = self.locators(name);
+        let host = self.host(name)?;
+        host.set_connect(connect);
+        host.restart()
+    }
+
+    /// Waits until every host that runs sees every other one that runs.
+    ///
+    /// # Errors
+    /// [`Error::Waited`] with who sees whom.
+    pub fn wait_joined(&mut self) -> Result<(), Error> {
+        let running: Vec<(String, Api)> = self
+            .hosts_mut()
+            .filter_map(|host| host.is_running().then(|| (host.name.clone(), host.api())))
+            .collect();
+        let mut names: Vec<&str> = running.iter().map(|(name, _)| name.as_str()).collect();
+        names.sort_unstable();
+        wait_until("all hosts to see each other", JOIN_MAX, || {
+            for (name, api) in &running {
+                let hosts = api.hosts().map_err(|error| error.to_string())?;
+                let mut seen: Vec<&str> = hosts
+                    .iter()
+                    .filter(|host| host["alive"] == true)
+                    .filter_map(|host| host["name"].as_str())
+                    .collect();
+                seen.sort_unstable();
+                if seen != names {
+                    return Err(format!("{name} sees {seen:?}, not {names:?}"));
+                }
+            }
+            Ok(())
+        })
+    }
+
+    /// The API of a host that runs: the plant's, where it does.
+    ///
+    /// # Errors
+    /// [`Error::NoHost`] where none runs.
+    pub fn api(&mut self) -> Result<Api, Error> {
+        self.hosts_mut()
+            .find_map(|host| host.is_running().then(|| host.api()))
+            .ok_or_else(|| Error::NoHost("no host of the cell runs".to_owned()))
+    }
+
+    /// The API of a host.
+    ///
+    /// # Errors
+    /// [`Error::NoHost`].
+    pub fn api_of(&mut self, name: &str) -> Result<Api, Error> {
+        self.host(name).map(|host| host.api())
+    }
+
+    /// The actuators' own log, as it is on disk now.
+    ///
+    /// # Errors
+    /// As [`Journal::read`].
+    pub fn journal(&self) -> Result<Journal, Error> {
+        Journal::read(self.plant.folder())
+    }
+
+    /// The cell's folder.
+    #[must_use]
+    pub fn folder(&self) -> &Path {
+        self.folder.path()
+    }
+}
+
+fn launcher(options: &CellOptions, name: &str) -> Vec<String> {
+    let found = options.launchers.iter().find(|(host, _)| host == name);
+    found.map(|(_, words)| words.clone()).unwrap_or_default()
+}
+
+fn controller_name(n: usize) -> String {
+    ('a'..='z')
+        .nth(n)
+        .map_or_else(|| format!("c{n}"), |letter| letter.to_string())
+}
+
+/// A number that no other test has.
+fn random() -> u64 {
+    // The system's generator does not fail on a machine that can run tests; the process id is then unique enough.
+    getrandom::u64().unwrap_or_else(|_| u64::from(std::process::id()))
+}
+
+/// The pressure of the pilot plant's vessel by its pump, as a loop to apply.
+#[must_use]
+pub fn pressure_loop(component: &str, period_ms: f64) -> Value {
+    json!({
+        "name": "pressure",
+        "component": component,
+        "period_ms": period_ms,
+        "ports": { "pv": "plant.pit129", "out": "plant.p1" },
+        "parameters": { "k": 3.0, "ti": 3.0, "out-low": 0.0, "out-high": 10.0 },
+        "setpoint": 0.5,
+        "strategy": "round-robin",
+    })
+}
