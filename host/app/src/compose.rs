@@ -57,7 +57,10 @@ struct Outlets {
 
 impl Outlets {
     fn new() -> Self {
-        Self { early: Mutex::new(Some(Vec::new())), ..Self::default() }
+        Self {
+            early: Mutex::new(Some(Vec::new())),
+            ..Self::default()
+        }
     }
 
     fn arrive(&self, arrival: Arrival) {
@@ -94,12 +97,18 @@ impl Outlets {
 pub async fn run(config: Config) -> Result<Running, Error> {
     let clock = Clock::start();
     let data = config.data.clone();
-    let store = blocking(move || Store::open(&data)).await?.map_err(|e| Error::start("the store", e))?;
+    let store = blocking(move || Store::open(&data))
+        .await?
+        .map_err(|e| Error::start("the store", e))?;
     let writer = RecordWriter::start(store.clone()).map_err(|e| Error::start("the record writer", e))?;
     let mut engine_config = config.engine.clone();
     engine_config.cache_dir = Some(config.data.join("compiled"));
-    engine_config.cache_key = store.secret("compiled-code").map_err(|e| Error::start("the store", e))?;
-    let engine = blocking(move || Engine::new(engine_config)).await?.map_err(|e| Error::start("the engine", e))?;
+    engine_config.cache_key = store
+        .secret("compiled-code")
+        .map_err(|e| Error::start("the store", e))?;
+    let engine = blocking(move || Engine::new(engine_config))
+        .await?
+        .map_err(|e| Error::start("the engine", e))?;
     let io = if config.io {
         let runtime = tokio::runtime::Handle::current();
         let server = IoServer::open(&config.buses, clock, &runtime).map_err(|e| Error::start("the I/O", e))?;
@@ -108,7 +117,10 @@ pub async fn run(config: Config) -> Result<Running, Error> {
         None
     };
     let listener = TcpListener::bind(config.api_listen).await.map_err(|source| {
-        let place = format!("the API on {}: choose another address with [api] listen", config.api_listen);
+        let place = format!(
+            "the API on {}: choose another address with [api] listen",
+            config.api_listen
+        );
         Error::start("the API", format!("{place} ({source})"))
     })?;
     let api = listener.local_addr().map_err(|e| Error::start("the API", e))?;
@@ -122,12 +134,17 @@ pub async fn run(config: Config) -> Result<Running, Error> {
                 let reason = format!("another process of the cell (instance {instance}) has this host's name");
                 let source = format!("{reason}; give each host its own name");
                 // A full list already holds a reason to stop.
-                drop(fail.try_send(Error::Failed { what: "joining the cell", source: source.into() }));
+                drop(fail.try_send(Error::Failed {
+                    what: "joining the cell",
+                    source: source.into(),
+                }));
             }
             other => outlets.arrive(other),
         })
     };
-    let session = Session::open(&config.cell, sink).await.map_err(|e| Error::start("the bus", e))?;
+    let session = Session::open(&config.cell, sink)
+        .await
+        .map_err(|e| Error::start("the bus", e))?;
     let locators = session.locators();
     let report = {
         let outlets = Arc::clone(&outlets);
@@ -138,8 +155,16 @@ pub async fn run(config: Config) -> Result<Running, Error> {
         })
     };
     let wire = Arc::new(session.clone());
-    let loops = Loops::start(&config.loops, config.host.clone(), clock, io.clone(), engine.clone(), wire, report)
-        .map_err(|e| Error::start("the loops", e))?;
+    let loops = Loops::start(
+        &config.loops,
+        config.host.clone(),
+        clock,
+        io.clone(),
+        engine.clone(),
+        wire,
+        report,
+    )
+    .map_err(|e| Error::start("the loops", e))?;
     let deploy = Deploy::start(Parts {
         session: session.clone(),
         store,
@@ -148,7 +173,10 @@ pub async fn run(config: Config) -> Result<Running, Error> {
         io: io.clone(),
         clock,
         field: Arc::new(loops.clone()),
-        roles: Roles { io: config.io, control: config.control },
+        roles: Roles {
+            io: config.io,
+            control: config.control,
+        },
         api: Some(format!("http://{api}")),
         version: env!("CARGO_PKG_VERSION").to_owned(),
     })
@@ -165,7 +193,17 @@ pub async fn run(config: Config) -> Result<Running, Error> {
     };
     let serving = bumpless_api::serve(listener, deploy.clone(), bumpless_api::Options::default(), stopped);
     let api_task = tokio::spawn(serving);
-    Ok(Running { api, locators, deploy, loops, io, session, stop_api, api_task, failures })
+    Ok(Running {
+        api,
+        locators,
+        deploy,
+        loops,
+        io,
+        session,
+        stop_api,
+        api_task,
+        failures,
+    })
 }
 
 impl Running {
@@ -212,5 +250,7 @@ impl Running {
 }
 
 async fn blocking<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> Result<T, Error> {
-    tokio::task::spawn_blocking(work).await.map_err(|e| Error::start("a part of the host", e))
+    tokio::task::spawn_blocking(work)
+        .await
+        .map_err(|e| Error::start("a part of the host", e))
 }

@@ -1,0 +1,425 @@
+//! The command line: what can be typed, and which command it runs.
+//!
+//! Never: does the work; `commands`, `watch`, `host` and `demo` do.
+
+use std::path::PathBuf;
+
+use clap::{CommandFactory as _, Parser, Subcommand, ValueEnum};
+use clap_complete::Shell;
+
+use crate::{client::Client, commands, demo, error::Error, host, watch};
+
+/// Where the API is expected.
+const API_DEFAULT: &str = "http://127.0.0.1:8480";
+
+/// A WebAssembly-sandboxed controller host: swap controllers, lose hosts, and the actuator does not feel it.
+///
+/// Exit codes: 0 done, 1 failed, 2 wrong command line, 3 refused by the cell (nothing changed), 4 API not reachable.
+#[derive(Debug, Parser)]
+#[command(name = "bumpless", version, propagate_version = true, max_term_width = 110)]
+pub struct Cli {
+    #[command(subcommand)]
+    pub(crate) command: Command,
+    #[command(flatten)]
+    pub(crate) to: To,
+}
+
+/// Where a command goes, and how its answer is printed.
+#[derive(Debug, Clone, clap::Args)]
+pub(crate) struct To {
+    /// Address of any host's API.
+    #[arg(long, global = true, env = "BUMPLESS_API", default_value = API_DEFAULT, value_name = "URL")]
+    pub(crate) api: String,
+    /// Print the API's JSON instead of text for people.
+    #[arg(long, global = true)]
+    pub(crate) json: bool,
+}
+
+/// What can be done.
+#[derive(Debug, Subcommand)]
+pub(crate) enum Command {
+    /// Run one host of a cell.
+    Host(HostArgs),
+    /// Start a whole cell on this machine: a simulated plant, three controller hosts, one running loop.
+    Demo(DemoArgs),
+    /// Upload a component (a .wasm file) to the cell's library.
+    Upload {
+        /// The component.
+        file: PathBuf,
+        /// A line about it, for people.
+        #[arg(long, default_value = "")]
+        note: String,
+    },
+    /// The library: list, show, download, delete.
+    Components {
+        #[command(subcommand)]
+        what: Option<ComponentsCommand>,
+    },
+    /// Loops: apply, list, show, command, swap, roll back.
+    Loop {
+        #[command(subcommand)]
+        what: LoopCommand,
+    },
+    /// Run one step of a component somewhere in the cell.
+    Call(CallArgs),
+    /// List the hosts of the cell.
+    Hosts,
+    /// List the points with their values.
+    Points,
+    /// Follow a loop: trend, who stepped, control indices.
+    Watch(WatchArgs),
+    /// Print a completion script for a shell.
+    Completions {
+        /// Which shell.
+        shell: Shell,
+    },
+    /// What a host runs to compile a component apart from itself.
+    #[command(hide = true)]
+    CompileChild {
+        /// The component.
+        input: PathBuf,
+        /// Where the compiled code goes.
+        output: PathBuf,
+    },
+}
+
+/// How a host is run.
+#[derive(Debug, clap::Args)]
+pub(crate) struct HostArgs {
+    /// The configuration file.
+    #[arg(long, value_name = "FILE")]
+    pub(crate) config: PathBuf,
+    /// Folder for data, instead of the one in the file.
+    #[arg(long, value_name = "DIR")]
+    pub(crate) data: Option<PathBuf>,
+    /// Check the configuration and stop.
+    #[arg(long)]
+    pub(crate) check: bool,
+    /// How log lines look on the error output. BUMPLESS_LOG filters them, for example `info,bumpless_loops=debug`.
+    #[arg(long, value_enum, default_value_t = LogFormat::Text)]
+    pub(crate) log_format: LogFormat,
+    /// Stop when the standard input closes: for a parent that holds the other end.
+    #[arg(long, hide = true)]
+    pub(crate) until_stdin_closes: bool,
+}
+
+/// How log lines look.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum LogFormat {
+    /// For people.
+    Text,
+    /// One JSON object per line.
+    Json,
+}
+
+/// How the demonstration is run.
+#[derive(Debug, clap::Args)]
+pub(crate) struct DemoArgs {
+    /// Folder with pid.wasm, pidplus.wasm and on-off.wasm; found beside the program where not given.
+    #[arg(long, value_name = "DIR")]
+    pub(crate) components: Option<PathBuf>,
+    /// Folder for the hosts' configuration, data and logs; a new one under the system's temporary folder where not given.
+    #[arg(long, value_name = "DIR")]
+    pub(crate) dir: Option<PathBuf>,
+    /// Stop after so many seconds.
+    #[arg(long = "for", value_name = "SECONDS")]
+    pub(crate) for_s: Option<u64>,
+    /// Start a host that died again.
+    #[arg(long)]
+    pub(crate) restart: bool,
+}
+
+/// What can be done with the library.
+#[derive(Debug, Subcommand)]
+pub(crate) enum ComponentsCommand {
+    /// List it.
+    List,
+    /// Show one: ports, parameters, where it runs.
+    Show {
+        /// `name`, `name@version`, or a digest or its first 8 digits.
+        component: String,
+    },
+    /// Download one.
+    Download {
+        /// `name`, `name@version`, or a digest or its first 8 digits.
+        component: String,
+        /// Where to; `name-version.wasm` where not given.
+        #[arg(long, short, value_name = "FILE")]
+        output: Option<PathBuf>,
+    },
+    /// Delete one that no loop uses.
+    Delete {
+        /// `name`, `name@version`, or a digest or its first 8 digits.
+        component: String,
+    },
+}
+
+/// What can be done with loops.
+#[derive(Debug, Subcommand)]
+pub(crate) enum LoopCommand {
+    /// Create or change a loop from a file (TOML). Returns when it is in force.
+    Apply {
+        /// The loop file.
+        file: PathBuf,
+    },
+    /// List the loops.
+    List,
+    /// Show one loop.
+    Show {
+        /// The loop.
+        name: String,
+    },
+    /// Set the setpoint, parameters or the strategy: `setpoint=1.5 k=2 action=direct strategy=p2c`.
+    Set {
+        /// The loop.
+        name: String,
+        /// What to set.
+        #[arg(required = true, value_name = "KEY=VALUE", value_parser = pair)]
+        values: Vec<(String, String)>,
+    },
+    /// Set the setpoint.
+    Setpoint {
+        /// The loop.
+        name: String,
+        /// In the unit of the measurement.
+        #[arg(allow_negative_numbers = true)]
+        value: f64,
+    },
+    /// Put the loop in manual or automatic.
+    Mode {
+        /// The loop.
+        name: String,
+        /// Who decides the output.
+        mode: ModeWord,
+    },
+    /// Set outputs in manual: `40`, or `valve=40 pump=2` where there are several.
+    Output {
+        /// The loop.
+        name: String,
+        /// Values, by port or in the order of the output ports.
+        #[arg(required = true, value_name = "[PORT=]VALUE", allow_negative_numbers = true)]
+        values: Vec<String>,
+    },
+    /// Go on with another component, without a bump.
+    Swap {
+        /// The loop.
+        name: String,
+        /// `name`, `name@version`, or a digest or its first 8 digits.
+        component: String,
+    },
+    /// Go back to an earlier revision.
+    Rollback {
+        /// The loop.
+        name: String,
+        /// Which revision; the one before where not given.
+        #[arg(long, value_name = "REVISION")]
+        to: Option<u64>,
+    },
+    /// End a loop; its outputs stay as they are.
+    Delete {
+        /// The loop.
+        name: String,
+    },
+    /// Give the ownership to another host, between two cycles.
+    Move {
+        /// The loop.
+        name: String,
+        /// The host.
+        host: String,
+    },
+}
+
+/// Who decides the output.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum ModeWord {
+    /// The operator.
+    Manual,
+    /// The controller.
+    #[value(alias = "automatic")]
+    Auto,
+}
+
+impl From<ModeWord> for bumpless_api::types::Mode {
+    fn from(word: ModeWord) -> Self {
+        match word {
+            ModeWord::Manual => Self::Manual,
+            ModeWord::Auto => Self::Automatic,
+        }
+    }
+}
+
+/// One step from outside.
+#[derive(Debug, clap::Args)]
+pub(crate) struct CallArgs {
+    /// `name`, `name@version`, or a digest or its first 8 digits.
+    pub(crate) component: String,
+    /// Input values by port.
+    #[arg(long = "input", value_name = "PORT=VALUE", value_parser = number_pair)]
+    pub(crate) inputs: Vec<(String, f64)>,
+    /// Wanted value.
+    #[arg(long, default_value_t = 0.0, allow_negative_numbers = true)]
+    pub(crate) setpoint: f64,
+    /// Time since the call before, in ms.
+    #[arg(long, default_value_t = 100.0)]
+    pub(crate) dt_ms: f64,
+    /// Who decides the output.
+    #[arg(long, value_enum, default_value_t = ModeWord::Auto)]
+    pub(crate) mode: ModeWord,
+    /// How the replica is chosen: round-robin, random, cpu, latency, p2c, local or shard.
+    #[arg(long, default_value = "round-robin")]
+    pub(crate) strategy: bumpless_core::Strategy,
+    /// Parameters that differ from their defaults.
+    #[arg(long = "parameter", value_name = "NAME=VALUE", value_parser = number_pair)]
+    pub(crate) parameters: Vec<(String, f64)>,
+    /// What the outputs hold, by port.
+    #[arg(long = "track", value_name = "PORT=VALUE", value_parser = number_pair)]
+    pub(crate) track: Vec<(String, f64)>,
+    /// State from the call before, in base64.
+    #[arg(long)]
+    pub(crate) state: Option<String>,
+    /// Number of the call; chooses the turn in round-robin.
+    #[arg(long, default_value_t = 0)]
+    pub(crate) seq: u64,
+}
+
+/// How a loop is followed.
+#[derive(Debug, clap::Args)]
+pub(crate) struct WatchArgs {
+    /// The loop.
+    #[arg(value_name = "LOOP")]
+    pub(crate) name: String,
+    /// Print one line per cycle instead of drawing; so it is too where the output is no terminal.
+    #[arg(long)]
+    pub(crate) plain: bool,
+    /// Stop after so many cycles.
+    #[arg(long, value_name = "CYCLES")]
+    pub(crate) cycles: Option<u64>,
+}
+
+/// `key=value`.
+fn pair(text: &str) -> Result<(String, String), String> {
+    match text.split_once('=') {
+        Some((key, value)) if !key.is_empty() && !value.is_empty() => Ok((key.to_owned(), value.to_owned())),
+        _ => Err("write it as KEY=VALUE".to_owned()),
+    }
+}
+
+/// `key=number`.
+fn number_pair(text: &str) -> Result<(String, f64), String> {
+    let (key, value) = pair(text)?;
+    value
+        .parse()
+        .map(|number| (key, number))
+        .map_err(|_| format!("{value:?} is no number"))
+}
+
+/// Runs what was typed.
+///
+/// # Errors
+/// What failed; its exit code says of which sort.
+pub fn run(cli: Cli) -> Result<(), Error> {
+    let client = || Client::new(&cli.to.api);
+    let json = cli.to.json;
+    match cli.command {
+        Command::Host(args) => host::run(&args),
+        Command::Demo(args) => demo::run(&args),
+        Command::Upload { file, note } => commands::components::upload(&client()?, json, &file, &note),
+        Command::Components { what } => {
+            commands::components::run(&client()?, json, what.unwrap_or(ComponentsCommand::List))
+        }
+        Command::Loop { what } => commands::loops::run(&client()?, json, what),
+        Command::Call(args) => commands::components::call(&client()?, json, args),
+        Command::Hosts => commands::hosts::list(&client()?, json),
+        Command::Points => commands::hosts::points(&client()?, json),
+        Command::Watch(args) => watch::run(client()?, json, &args),
+        Command::Completions { shell } => {
+            clap_complete::generate(shell, &mut Cli::command(), "bumpless", &mut std::io::stdout());
+            Ok(())
+        }
+        Command::CompileChild { input, output } => {
+            bumpless_engine::compile_child::run(&input, &output).map_err(|source| Error::Failed {
+                what: "the compilation",
+                source: source.into(),
+            })
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_command_line_holds_together() {
+        Cli::command().debug_assert();
+    }
+
+    #[test]
+    fn what_is_typed_is_understood() {
+        let parse = |text: &str| Cli::try_parse_from(text.split(' '));
+        for good in [
+            "bumpless host --config host.toml --data /tmp/x --check",
+            "bumpless upload pid.wasm --note x --json",
+            "bumpless components",
+            "bumpless --json components show pid@1.0.0",
+            "bumpless components download pid -o x.wasm",
+            "bumpless loop apply loop.toml",
+            "bumpless loop set pressure setpoint=1.5 k=2 strategy=p2c --api http://127.0.0.1:1",
+            "bumpless loop setpoint t -5",
+            "bumpless loop mode pressure automatic",
+            "bumpless loop mode pressure auto",
+            "bumpless loop output pressure -4.5",
+            "bumpless loop output pressure valve=4 pump=5",
+            "bumpless loop rollback pressure --to 3",
+            "bumpless call pid --input pv=1 --input ff=-2 --strategy latency",
+            "bumpless watch pressure --plain --cycles 5",
+            "bumpless demo --for 5 --restart",
+            "bumpless completions bash",
+            "bumpless compile-child in out",
+        ] {
+            assert!(parse(good).is_ok(), "{good}: {:?}", parse(good).err());
+        }
+        for (bad, part) in [
+            ("bumpless host", "--config"),
+            ("bumpless loop set pressure", "KEY=VALUE"),
+            ("bumpless loop set pressure setpoint", "write it as KEY=VALUE"),
+            ("bumpless loop mode pressure fast", "[possible values: manual, auto]"),
+            ("bumpless call pid --input pv=x", "\"x\" is no number"),
+            ("bumpless call pid --strategy best", "use round-robin, random, cpu"),
+            ("bumpless lop", "'loop'"),
+        ] {
+            let error = parse(bad).expect_err(bad);
+            assert_eq!(error.exit_code(), 2, "{bad}");
+            assert!(error.to_string().contains(part), "{bad}: {error}");
+        }
+    }
+
+    #[test]
+    fn the_api_comes_from_the_command_line_or_its_default() {
+        let cli = Cli::try_parse_from(["bumpless", "hosts", "--api", "http://10.0.0.1:80"]).expect("good");
+        assert_eq!((cli.to.api.as_str(), cli.to.json), ("http://10.0.0.1:80", false));
+    }
+
+    #[test]
+    fn help_lists_the_commands_in_the_order_of_their_use() {
+        let help = Cli::command().render_help().to_string();
+        let places: Vec<usize> = [
+            "host ",
+            "demo ",
+            "upload ",
+            "components ",
+            "loop ",
+            "call ",
+            "hosts ",
+            "watch ",
+        ]
+        .iter()
+        .map(|word| {
+            help.find(&format!("\n  {word}"))
+                .unwrap_or_else(|| panic!("{word} is not in the help:\n{help}"))
+        })
+        .collect();
+        assert!(places.is_sorted(), "{help}");
+        assert!(!help.contains("compile-child"), "{help}");
+    }
+}

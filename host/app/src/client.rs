@@ -1,0 +1,221 @@
+//! Asks the API: one agent, one address, every failure an [`Error`] of the right sort.
+//!
+//! Never: repeats a request by itself; only the asker knows whether twice is right.
+
+use std::{io::Read, time::Duration};
+
+use bumpless_api::Problem;
+use serde::{Serialize, de::DeserializeOwned};
+use ureq::{
+    Agent, Body, SendBody,
+    http::{Response, StatusCode},
+};
+
+use crate::error::Error;
+
+/// Longest wait for a connection: a host that does not take one in this time is not there.
+const CONNECT_TIME_MAX: Duration = Duration::from_secs(3);
+/// Longest wait for the head of an answer: above the longest that the API allows itself for an upload.
+const ANSWER_TIME_MAX: Duration = Duration::from_secs(160);
+/// Longest time for the rest of an answer.
+const BODY_TIME_MAX: Duration = Duration::from_secs(120);
+/// Bytes of an answer: the longest list of loops has some tens of MB.
+const ANSWER_BYTES_MAX: u64 = 64 * 1024 * 1024;
+
+/// A way to one host's API.
+#[derive(Debug, Clone)]
+pub(crate) struct Client {
+    agent: Agent,
+    base: String,
+}
+
+/// The text of a good answer.
+pub(crate) struct Answer {
+    api: String,
+    pub(crate) text: String,
+}
+
+impl Answer {
+    /// What the text means.
+    pub(crate) fn decode<T: DeserializeOwned>(&self) -> Result<T, Error> {
+        serde_json::from_str(&self.text).map_err(|error| Error::Answer {
+            api: self.api.clone(),
+            reason: format!("its JSON: {error}"),
+        })
+    }
+}
+
+impl Client {
+    /// For the API at `api`, such as `http://127.0.0.1:8480`.
+    pub(crate) fn new(api: &str) -> Result<Self, Error> {
+        let base = api.trim_end_matches('/').to_owned();
+        if !base.starts_with("http://") {
+            return Err(Error::Usage(format!(
+                "{api:?} is no address of an API: write it as http://HOST:PORT (TLS ends at a proxy in front of it)"
+            )));
+        }
+        let config = Agent::config_builder()
+            .http_status_as_error(false)
+            .timeout_connect(Some(CONNECT_TIME_MAX))
+            .timeout_recv_response(Some(ANSWER_TIME_MAX))
+            // The API is meant as it was typed; proxies are for the world outside.
+            .proxy(None)
+            .max_redirects(0)
+            .user_agent(concat!("bumpless/", env!("CARGO_PKG_VERSION")))
+            .build();
+        Ok(Self {
+            agent: config.into(),
+            base,
+        })
+    }
+
+    /// The address.
+    pub(crate) fn api(&self) -> &str {
+        &self.base
+    }
+
+    fn unreachable(&self, error: &ureq::Error) -> Error {
+        Error::Unreachable {
+            api: self.base.clone(),
+            reason: error.to_string(),
+        }
+    }
+
+    /// The text of a good answer, or the problem in it.
+    fn answer(&self, response: Result<Response<Body>, ureq::Error>) -> Result<Answer, Error> {
+        let response = self.good(response)?;
+        let mut body = response.into_body();
+        let text = body
+            .with_config()
+            .limit(ANSWER_BYTES_MAX)
+            .read_to_string()
+            .map_err(|e| self.unreachable(&e))?;
+        Ok(Answer {
+            api: self.base.clone(),
+            text,
+        })
+    }
+
+    /// A good answer whose body is still to be read, or the problem in it.
+    fn good(&self, response: Result<Response<Body>, ureq::Error>) -> Result<Response<Body>, Error> {
+        let response = response.map_err(|error| self.unreachable(&error))?;
+        let status = response.status();
+        if status.is_success() {
+            return Ok(response);
+        }
+        let text = response
+            .into_body()
+            .with_config()
+            .limit(ANSWER_BYTES_MAX)
+            .read_to_string();
+        let text = text.map_err(|error| self.unreachable(&error))?;
+        Err(self.problem(status, &text))
+    }
+
+    fn problem(&self, status: StatusCode, text: &str) -> Error {
+        match serde_json::from_str::<Problem>(text) {
+            Ok(problem) => Error::Problem(Box::new(problem)),
+            Err(_) => Error::Answer {
+                api: self.base.clone(),
+                reason: format!("status {status} without a problem in JSON; is this the API of a host?"),
+            },
+        }
+    }
+
+    /// `GET` with a time limit on the body.
+    pub(crate) fn get(&self, path: &str) -> Result<Answer, Error> {
+        let request = self.agent.get(format!("{}{path}", self.base));
+        self.answer(request.config().timeout_recv_body(Some(BODY_TIME_MAX)).build().call())
+    }
+
+    /// `GET` of raw bytes, at most `bytes_max`.
+    pub(crate) fn bytes(&self, path: &str, bytes_max: u64) -> Result<Vec<u8>, Error> {
+        let request = self.agent.get(format!("{}{path}", self.base));
+        let response = self.good(request.config().timeout_recv_body(Some(BODY_TIME_MAX)).build().call())?;
+        response
+            .into_body()
+            .with_config()
+            .limit(bytes_max)
+            .read_to_vec()
+            .map_err(|error| self.unreachable(&error))
+    }
+
+    /// `GET` of a body without an end, to be read piece by piece. A silence longer than `silence_max` ends it.
+    pub(crate) fn stream(&self, path: &str, silence_max: Duration) -> Result<impl Read + Send + use<>, Error> {
+        let request = self.agent.get(format!("{}{path}", self.base));
+        let response = self.good(request.config().timeout_per_read(Some(silence_max)).build().call())?;
+        Ok(response.into_body().into_with_config().limit(u64::MAX).reader())
+    }
+
+    /// `POST` of JSON.
+    pub(crate) fn post(&self, path: &str, body: &impl Serialize) -> Result<Answer, Error> {
+        self.answer(self.agent.post(format!("{}{path}", self.base)).send_json(body))
+    }
+
+    /// `PUT` of JSON.
+    pub(crate) fn put(&self, path: &str, body: &impl Serialize) -> Result<Answer, Error> {
+        self.answer(self.agent.put(format!("{}{path}", self.base)).send_json(body))
+    }
+
+    /// `DELETE`.
+    pub(crate) fn delete(&self, path: &str) -> Result<Answer, Error> {
+        self.answer(self.agent.delete(format!("{}{path}", self.base)).call())
+    }
+
+    /// `POST` of `length` bytes of a component.
+    pub(crate) fn upload(&self, path: &str, length: u64, bytes: &mut dyn Read) -> Result<Answer, Error> {
+        let request = self
+            .agent
+            .post(format!("{}{path}", self.base))
+            .header("content-type", "application/wasm")
+            .header("content-length", length.to_string());
+        self.answer(request.send(SendBody::from_reader(bytes)))
+    }
+}
+
+/// One segment of a path or one value of a query, percent-encoded (RFC 3986): unreserved characters and `@` stay.
+pub(crate) fn encoded(text: &str) -> String {
+    let mut out = String::with_capacity(text.len());
+    for byte in text.bytes() {
+        if byte.is_ascii_alphanumeric() || b"-._~@".contains(&byte) {
+            out.push(char::from(byte));
+        } else {
+            out.push_str(&format!("%{byte:02X}"));
+        }
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_stay_and_the_rest_is_encoded() {
+        assert_eq!(encoded("pid@1.0.0"), "pid@1.0.0");
+        assert_eq!(encoded("../a b?ü"), "..%2Fa%20b%3F%C3%BC");
+    }
+
+    #[test]
+    fn addresses_are_checked() {
+        let error = Client::new("127.0.0.1:8480").expect_err("no scheme");
+        assert!(error.to_string().contains("http://HOST:PORT"), "{error}");
+        assert_eq!(
+            Client::new("http://127.0.0.1:8480/").expect("good").api(),
+            "http://127.0.0.1:8480"
+        );
+    }
+
+    #[test]
+    fn an_api_that_is_not_there_is_said_to_be_so() {
+        // A port that was free a moment ago, on which nobody listens now.
+        let port = std::net::TcpListener::bind("127.0.0.1:0")
+            .and_then(|l| l.local_addr())
+            .expect("a port")
+            .port();
+        let client = Client::new(&format!("http://127.0.0.1:{port}")).expect("good");
+        let error = client.get("/v1/hosts").map(|_| ()).expect_err("nobody there");
+        assert_eq!(error.exit_code(), 4, "{error}");
+        assert!(error.report().contains("bumpless demo"), "{}", error.report());
+    }
+}

@@ -1,0 +1,7 @@
+//! The commands that ask the API once and print its answer.
+//!
+//! Never: decide; what the cell refuses is an error with the cell's own words.
+
+pub(crate) mod components;
+pub(crate) mod hosts;
+pub(crate) mod loops;

@@ -1,0 +1,493 @@
+//! The host's configuration file: TOML, every key known, every error with the file, the key and the cure.
+//!
+//! ```toml
+//! host = "a"                       # this host's name, unique in the cell
+//! data = "data"                    # components, last records, keys; beside this file
+//!
+//! [cell]
+//! name = "demo"
+//! listen = ["tcp/127.0.0.1:0"]     # where other hosts reach this one
+//! connect = []                     # one that is up is enough
+//!
+//! [api]
+//! listen = "127.0.0.1:8480"
+//!
+//! [[bus]]                          # points, if this host serves any
+//! id = "plant"
+//! driver = "sim"
+//! ```
+//! Relative paths count from the folder of the file. Never: opens anything but the file.
+
+use std::{
+    net::{Ipv4Addr, SocketAddr},
+    path::{Path, PathBuf},
+    time::Duration,
+};
+
+use bumpless_core::{CellName, HostId};
+use bumpless_io::BusConfig;
+use serde::{Deserialize, Serialize};
+
+use crate::error::Error;
+
+/// Bytes of a configuration file: thousands of points fit; a mistaken path to a large file does not.
+const FILE_BYTES_MAX: u64 = 16 * 1024 * 1024;
+
+/// Everything that a host is told, checked as far as text can be.
+#[derive(Debug, Clone)]
+pub struct Config {
+    /// Where it was read, for messages.
+    pub path: PathBuf,
+    /// This host's name.
+    pub host: HostId,
+    /// Folder of everything that outlives the process.
+    pub data: PathBuf,
+    /// The bus between hosts.
+    pub cell: bumpless_cell::Config,
+    /// Where the API listens.
+    pub api_listen: SocketAddr,
+    /// Does it serve points? There are buses, then.
+    pub io: bool,
+    /// Does it run controllers?
+    pub control: bool,
+    /// Buses with their points.
+    pub buses: bumpless_io::Config,
+    /// The sandbox; folder and key of the compiled code are for the composition to fill in.
+    pub engine: bumpless_engine::Config,
+    /// The threads of the loops.
+    pub loops: bumpless_loops::Config,
+}
+
+/// The file.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct File {
+    host: HostId,
+    #[serde(default = "data_default")]
+    data: PathBuf,
+    cell: CellTable,
+    #[serde(default)]
+    api: ApiTable,
+    #[serde(default)]
+    roles: RolesTable,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    bus: Vec<BusConfig>,
+    #[serde(default)]
+    engine: EngineTable,
+    #[serde(default)]
+    loops: LoopsTable,
+}
+
+fn data_default() -> PathBuf {
+    PathBuf::from("data")
+}
+
+/// How the host joins its cell; what is left out is as `bumpless_cell::Config` has it.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct CellTable {
+    name: CellName,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    listen: Option<Vec<String>>,
+    #[serde(default)]
+    connect: Vec<String>,
+    #[serde(default)]
+    scouting: bool,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    lease_ms: Option<u64>,
+}
+
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+struct ApiTable {
+    listen: SocketAddr,
+}
+
+impl Default for ApiTable {
+    fn default() -> Self {
+        // Loopback: whoever reaches the API may operate the cell.
+        Self {
+            listen: SocketAddr::from((Ipv4Addr::LOCALHOST, 8480)),
+        }
+    }
+}
+
+/// What is left out follows from the buses: a host with points serves them, one without runs controllers.
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+struct RolesTable {
+    #[serde(skip_serializing_if = "Option::is_none")]
+    io: Option<bool>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    control: Option<bool>,
+}
+
+/// Bounds of the sandbox; what is left out is as `bumpless_engine::Limits` has it.
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+struct EngineTable {
+    #[serde(skip_serializing_if = "Option::is_none")]
+    instances_max: Option<u32>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    memory_mib_max: Option<usize>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    cached_max: Option<usize>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    compile: Option<CompileWord>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    compile_memory_mib_max: Option<u64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    compile_s_max: Option<u64>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+enum CompileWord {
+    Child,
+    InProcess,
+}
+
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+struct LoopsTable {
+    #[serde(skip_serializing_if = "Option::is_none")]
+    workers: Option<usize>,
+}
+
+impl Config {
+    /// Reads and checks a file. `data` replaces the file's folder for data; it counts from the working directory.
+    ///
+    /// # Errors
+    /// The file cannot be read, or what is wrong in it.
+    pub fn read(path: &Path, data: Option<&Path>) -> Result<Self, Error> {
+        let file_error = |source| Error::File {
+            path: path.to_owned(),
+            action: "read",
+            source,
+        };
+        let size = std::fs::metadata(path).map_err(file_error)?.len();
+        if size > FILE_BYTES_MAX {
+            return Err(Error::Config {
+                path: path.to_owned(),
+                place: "the file".to_owned(),
+                reason: format!("it has {size} bytes; a configuration has at most {FILE_BYTES_MAX}"),
+            });
+        }
+        let text = std::fs::read_to_string(path).map_err(file_error)?;
+        let mut config = Self::parse(&text, path)?;
+        if let Some(data) = data {
+            data.clone_into(&mut config.data);
+        }
+        Ok(config)
+    }
+
+    /// Checks a text as if it stood in the file at `path`.
+    ///
+    /// # Errors
+    /// What is wrong in it.
+    pub fn parse(text: &str, path: &Path) -> Result<Self, Error> {
+        let file: File = toml::from_str(text).map_err(|error| Error::Config {
+            path: path.to_owned(),
+            place: place(text, error.span()),
+            reason: error.message().to_owned(),
+        })?;
+        let folder = path.parent().unwrap_or(Path::new(""));
+        file.checked(path, folder)
+    }
+}
+
+impl File {
+    fn checked(self, path: &Path, folder: &Path) -> Result<Config, Error> {
+        let wrong = |place: &str, reason: String| Error::Config {
+            path: path.to_owned(),
+            place: format!("key {place}"),
+            reason,
+        };
+        let mut cell = bumpless_cell::Config::new(self.cell.name, self.host.clone());
+        cell.connect = self.cell.connect;
+        cell.scouting = self.cell.scouting;
+        if let Some(listen) = self.cell.listen {
+            cell.listen = listen;
+        }
+        if let Some(lease_ms) = self.cell.lease_ms {
+            cell.lease_ms = lease_ms;
+        }
+        cell.check().map_err(|error| wrong("cell", error.to_string()))?;
+
+        let mut ids = std::collections::HashSet::new();
+        if let Some(twice) = self.bus.iter().find(|bus| !ids.insert(bus.id())) {
+            return Err(wrong(
+                "bus.id",
+                format!("two buses are named {}; give each its own name", twice.id()),
+            ));
+        }
+        let mut buses = bumpless_io::Config { buses: self.bus };
+        for bus in &mut buses.buses {
+            if let BusConfig::Sim(sim) = bus {
+                sim.journal = sim.journal.take().map(|journal| folder.join(journal));
+            }
+        }
+        let has_buses = !buses.buses.is_empty();
+        let io = self.roles.io.unwrap_or(has_buses);
+        if io && !has_buses {
+            return Err(wrong(
+                "roles.io",
+                "a host that serves I/O needs a [[bus]]; add one, or set io = false".into(),
+            ));
+        }
+        if !io && has_buses {
+            return Err(wrong(
+                "roles.io",
+                "io = false, but there are buses; remove them, or the key".into(),
+            ));
+        }
+        let control = self.roles.control.unwrap_or(!has_buses);
+        if !io && !control {
+            return Err(wrong(
+                "roles",
+                "a host without any role does nothing; set io or control to true".into(),
+            ));
+        }
+        Ok(Config {
+            path: path.to_owned(),
+            host: self.host,
+            data: folder.join(self.data),
+            cell,
+            api_listen: self.api.listen,
+            io,
+            control,
+            buses,
+            engine: self.engine.checked(&wrong)?,
+            loops: self.loops.checked(&wrong)?,
+        })
+    }
+}
+
+impl EngineTable {
+    fn checked(&self, wrong: &dyn Fn(&str, String) -> Error) -> Result<bumpless_engine::Config, Error> {
+        let mut config = bumpless_engine::Config::default();
+        let limits = &mut config.limits;
+        config.instances_max = in_range(
+            wrong,
+            "engine.instances_max",
+            self.instances_max,
+            config.instances_max,
+            1,
+            100_000,
+        )?;
+        let memory_mib = in_range(wrong, "engine.memory_mib_max", self.memory_mib_max, 16, 1, 1024)?;
+        limits.memory_bytes_max = memory_mib * 1024 * 1024;
+        limits.cached_max = in_range(
+            wrong,
+            "engine.cached_max",
+            self.cached_max,
+            limits.cached_max,
+            1,
+            100_000,
+        )?;
+        let child_mib = in_range(
+            wrong,
+            "engine.compile_memory_mib_max",
+            self.compile_memory_mib_max,
+            2048,
+            256,
+            65_536,
+        )?;
+        limits.compile_memory_bytes_max = child_mib * 1024 * 1024;
+        limits.compile_time_max =
+            Duration::from_secs(in_range(wrong, "engine.compile_s_max", self.compile_s_max, 60, 1, 60)?);
+        config.compile = match self.compile.unwrap_or(CompileWord::Child) {
+            CompileWord::InProcess => bumpless_engine::Compile::InProcess,
+            CompileWord::Child => bumpless_engine::Compile::Child {
+                program: std::env::current_exe()
+                    .map_err(|error| wrong("engine.compile", format!("this program cannot find itself: {error}")))?,
+                args: vec!["compile-child".into()],
+            },
+        };
+        Ok(config)
+    }
+}
+
+impl LoopsTable {
+    fn checked(&self, wrong: &dyn Fn(&str, String) -> Error) -> Result<bumpless_loops::Config, Error> {
+        let default = bumpless_loops::Config::default();
+        Ok(bumpless_loops::Config {
+            workers: in_range(wrong, "loops.workers", self.workers, default.workers, 1, 64)?,
+        })
+    }
+}
+
+/// The value given, or the default; refused outside `low` to `high`.
+fn in_range<T: PartialOrd + Copy + std::fmt::Display>(
+    wrong: &dyn Fn(&str, String) -> Error,
+    key: &str,
+    given: Option<T>,
+    default: T,
+    low: T,
+    high: T,
+) -> Result<T, Error> {
+    match given {
+        Some(value) if value < low || value > high => Err(wrong(key, format!("it is {value}; use {low} to {high}"))),
+        Some(value) => Ok(value),
+        None => Ok(default),
+    }
+}
+
+/// Line and key at a span of the text: `line 4, key lease`.
+pub(crate) fn place(text: &str, span: Option<std::ops::Range<usize>>) -> String {
+    let Some(before) = span.and_then(|span| text.get(..span.start)) else {
+        return "the file".to_owned();
+    };
+    let number = before.matches('\n').count() + 1;
+    let line = text.lines().nth(number - 1).unwrap_or_default();
+    match line.split_once('=') {
+        Some((key, _)) => format!("line {number}, key {}", key.trim()),
+        None => format!("line {number}, {:?}", line.trim().chars().take(60).collect::<String>()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "tests")]
+
+    use super::*;
+
+    const LEAST: &str = "host = \"a\"\n[cell]\nname = \"demo\"\n";
+
+    fn parse(text: &str) -> Result<Config, Error> {
+        Config::parse(text, Path::new("/etc/bumpless/host.toml"))
+    }
+
+    #[test]
+    fn the_least_file_is_a_control_host_on_loopback() {
+        let config = parse(LEAST).expect("a good file");
+        assert_eq!((config.io, config.control), (false, true));
+        assert_eq!(config.api_listen.to_string(), "127.0.0.1:8480");
+        assert_eq!(config.data, Path::new("/etc/bumpless/data"));
+        assert_eq!(config.cell.listen, ["tcp/127.0.0.1:0"]);
+        assert_eq!(config.cell.lease_ms, 1000);
+        assert_eq!(
+            config.engine.limits.memory_bytes_max,
+            bumpless_engine::Limits::default().memory_bytes_max
+        );
+        assert_eq!(
+            config.engine.limits.compile_memory_bytes_max,
+            bumpless_engine::Limits::default().compile_memory_bytes_max
+        );
+        assert!(matches!(config.engine.compile, bumpless_engine::Compile::Child { .. }));
+    }
+
+    #[test]
+    fn a_full_file_is_taken_as_it_stands() {
+        let text = r#"
+            host = "plant"
+            data = "/var/lib/bumpless"
+            [cell]
+            name = "demo"
+            listen = ["tcp/10.0.0.1:7447"]
+            connect = ["tcp/10.0.0.2:7447"]
+            scouting = true
+            lease_ms = 300
+            [api]
+            listen = "[::1]:80"
+            [roles]
+            control = true
+            [[bus]]
+            id = "plant"
+            driver = "sim"
+            journal = "writes.csv"
+            [engine]
+            instances_max = 5
+            compile = "in-process"
+            [loops]
+            workers = 3
+        "#;
+        let config = parse(text).expect("a good file");
+        assert_eq!((config.io, config.control), (true, true));
+        assert_eq!(config.data, Path::new("/var/lib/bumpless"));
+        assert_eq!((config.cell.lease_ms, config.cell.scouting), (300, true));
+        assert_eq!(config.loops.workers, 3);
+        assert!(matches!(config.engine.compile, bumpless_engine::Compile::InProcess));
+        let BusConfig::Sim(sim) = &config.buses.buses[0] else {
+            panic!("a simulated bus")
+        };
+        assert_eq!(sim.journal.as_deref(), Some(Path::new("/etc/bumpless/writes.csv")));
+    }
+
+    #[test]
+    fn bad_files_say_where_and_what_helps() {
+        let bus = "[[bus]]\nid = \"plant\"\ndriver = \"sim\"\n";
+        let table: [(String, &[&str]); 17] = [
+            (String::new(), &["host.toml", "missing field `host`"]),
+            (
+                "host = \"A\"\n[cell]\nname = \"demo\"".into(),
+                &["line 1, key host", "'A'", "lower-case"],
+            ),
+            (
+                "host = \"a\"\ncell = \"demo\"".into(),
+                &["line 2, key cell", "CellTable"],
+            ),
+            (
+                format!("{LEAST}lease = 5"),
+                &["line 4, key lease", "unknown field `lease`", "`lease_ms`"],
+            ),
+            (
+                format!("{LEAST}lease_ms = 5"),
+                &["key cell", "lease_ms", "between 100 and 60000"],
+            ),
+            (
+                format!("{LEAST}listen = [\"quic/x:1\"]"),
+                &["key cell", "use tcp or unixsock-stream"],
+            ),
+            (
+                format!("{LEAST}[api]\nlisten = \"localhost\""),
+                &["line 5, key listen", "invalid socket address"],
+            ),
+            (
+                format!("{LEAST}[roles]\nio = true"),
+                &["key roles.io", "add one, or set io = false"],
+            ),
+            (
+                format!("{LEAST}[roles]\ncontrol = false"),
+                &["key roles", "set io or control"],
+            ),
+            (
+                format!("{LEAST}{bus}[roles]\nio = false"),
+                &["key roles.io", "remove them"],
+            ),
+            (
+                format!("{LEAST}{bus}{bus}"),
+                &["key bus.id", "two buses are named plant"],
+            ),
+            (
+                format!("{LEAST}[[bus]]\nid = \"x\"\ndriver = \"opc\""),
+                &["unknown variant `opc`", "modbus-tcp"],
+            ),
+            (
+                format!("{LEAST}[engine]\ninstances_max = 0"),
+                &["key engine.instances_max", "it is 0; use 1 to 100000"],
+            ),
+            (
+                format!("{LEAST}[engine]\ncompile = \"jit\""),
+                &["line 5, key compile", "`child` or `in-process`"],
+            ),
+            (
+                format!("{LEAST}[loops]\nworkers = 65"),
+                &["key loops.workers", "1 to 64"],
+            ),
+            (
+                format!("{LEAST}[loop]\nworkers = 2"),
+                &["line 4", "unknown field `loop`", "`loops`"],
+            ),
+            (format!("{LEAST}[[["), &["line 4"]),
+        ];
+        for (text, parts) in table {
+            let error = parse(&text).expect_err(&text).to_string();
+            for part in parts {
+                assert!(error.contains(part), "{text:?}: {part:?} is missing in: {error}");
+            }
+        }
+        let missing = Config::read(Path::new("/nowhere/host.toml"), None).expect_err("no such file");
+        assert!(missing.to_string().contains("/nowhere/host.toml"), "{missing}");
+    }
+}

@@ -1,0 +1,363 @@
+//! The demonstration's hosts as child processes.
+//!
+//! ```text
+//! planned ─► started ─► ready ─► dead (said once) ─► started again
+//!                └ no ready line in time, or ended: an error with the end of its log
+//! ```
+//! A child holds on to its standard input: when this process ends, however it ends, the children drain and stop.
+//! Never: restarts a child by itself.
+
+use std::{
+    fs::{self, File},
+    io::{BufRead as _, BufReader},
+    net::{Ipv4Addr, TcpListener},
+    os::unix::process::{CommandExt as _, ExitStatusExt as _},
+    path::{Path, PathBuf},
+    process::{self, ExitStatus, Stdio},
+    sync::{
+        atomic::{AtomicBool, Ordering},
+        mpsc,
+    },
+    time::{Duration, Instant},
+};
+
+use crate::{error::Error, host::Ready, show};
+
+/// Longest wait for a host to get ready.
+const READY_TIME_MAX: Duration = Duration::from_secs(30);
+/// Time that a host gets to drain and stop before it is killed.
+const STOP_TIME_MAX: Duration = Duration::from_secs(10);
+/// How often a waiting parent looks.
+const LOOK_EVERY: Duration = Duration::from_millis(50);
+/// Lines of a log that an error shows.
+const LOG_LINES: usize = 8;
+
+/// What is to be started.
+pub(super) struct Plan {
+    dir: PathBuf,
+    program: PathBuf,
+    /// Name and API port; 0 for any.
+    hosts: Vec<(String, u16)>,
+}
+
+impl Plan {
+    /// The first host serves the plant. Ports count up from `first_port` where they are free.
+    pub(super) fn new(dir: &Path, names: &[&str], first_port: u16) -> Result<Self, Error> {
+        let program = std::env::current_exe().map_err(|source| Error::File {
+            path: "this program".into(),
+            action: "found",
+            source,
+        })?;
+        let ports = (first_port..).map(|port| {
+            let free = TcpListener::bind((Ipv4Addr::LOCALHOST, port)).is_ok();
+            if free { port } else { 0 }
+        });
+        let hosts = names.iter().map(|name| (*name).to_owned()).zip(ports).collect();
+        Ok(Self {
+            dir: dir.to_owned(),
+            program,
+            hosts,
+        })
+    }
+
+    /// Writes a host's configuration and starts it.
+    fn spawn(&self, index: usize, connect: &[String]) -> Result<Starting, Error> {
+        let Some((name, port)) = self.hosts.get(index) else {
+            return Err(Error::Demo(format!("there is no host {index}")));
+        };
+        let dir = self.dir.join(name);
+        fs::create_dir_all(&dir).map_err(|source| Error::File {
+            path: dir.clone(),
+            action: "made",
+            source,
+        })?;
+        let config = dir.join("host.toml");
+        fs::write(&config, host_file(name, *port, connect, index == 0)).map_err(|source| Error::File {
+            path: config.clone(),
+            action: "written",
+            source,
+        })?;
+        let log = dir.join("log");
+        let errors = File::options().create(true).append(true).open(&log);
+        let errors = errors.map_err(|source| Error::File {
+            path: log.clone(),
+            action: "written",
+            source,
+        })?;
+        let mut process = process::Command::new(&self.program)
+            .args(["host", "--until-stdin-closes", "--config"])
+            .arg(&config)
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .stderr(errors)
+            // Its own group: Ctrl-C is for the parent, who stops the children in order.
+            .process_group(0)
+            .spawn()
+            .map_err(|source| Error::File {
+                path: self.program.clone(),
+                action: "started",
+                source,
+            })?;
+        let (sender, ready) = mpsc::channel();
+        if let Some(stdout) = process.stdout.take() {
+            // Ends with the child's standard output.
+            let read = move || {
+                for line in BufReader::new(stdout).lines().map_while(Result::ok) {
+                    if let Ok(line) = serde_json::from_str::<Ready>(&line) {
+                        // Nobody waits any more where the child was given up.
+                        let _ = sender.send(line);
+                    }
+                }
+            };
+            std::thread::Builder::new()
+                .name(format!("stdout-{name}"))
+                .spawn(read)
+                .map_err(|error| Error::start("the thread of a child", error))?;
+        }
+        Ok(Starting {
+            name: name.clone(),
+            log,
+            process,
+            ready,
+        })
+    }
+}
+
+/// A host's configuration.
+fn host_file(name: &str, port: u16, connect: &[String], plant: bool) -> String {
+    let connect: Vec<String> = connect.iter().map(|at| format!("{at:?}")).collect();
+    let mut text = format!(
+        "# A host of the demonstration; the next start replaces this file.\nhost = \"{name}\"\n\n\
+         [cell]\nname = \"demo\"\nlisten = [\"tcp/127.0.0.1:0\"]\nconnect = [{}]\n\n\
+         [api]\nlisten = \"127.0.0.1:{port}\"\n",
+        connect.join(", ")
+    );
+    if plant {
+        text.push_str("\n[[bus]]\nid = \"plant\"\ndriver = \"sim\"\nseed = 1\non_stop = \"safe\"\n");
+    }
+    text
+}
+
+/// A host that is not ready yet.
+struct Starting {
+    name: String,
+    log: PathBuf,
+    process: process::Child,
+    ready: mpsc::Receiver<Ready>,
+}
+
+impl Starting {
+    /// Waits for its word; ends it where none comes.
+    fn wait(mut self, stop: &AtomicBool) -> Result<Child, Error> {
+        let until = Instant::now() + READY_TIME_MAX;
+        let why = loop {
+            if let Ok(ready) = self.ready.recv_timeout(LOOK_EVERY) {
+                return Ok(Child {
+                    name: self.name,
+                    log: self.log,
+                    process: self.process,
+                    ready,
+                    dead: false,
+                });
+            }
+            if let Ok(Some(status)) = self.process.try_wait() {
+                break in_words(status);
+            }
+            if stop.load(Ordering::Relaxed) {
+                break "was told to stop".to_owned();
+            }
+            if Instant::now() >= until {
+                break format!("was not ready within {} s", READY_TIME_MAX.as_secs());
+            }
+        };
+        end(&mut self.process, Duration::ZERO);
+        Err(Error::Demo(format!("host {} {why}{}", self.name, log_end(&self.log))))
+    }
+}
+
+/// A host that is, or was, ready.
+pub(super) struct Child {
+    /// Its name.
+    pub(super) name: String,
+    /// Where its log lines go.
+    pub(super) log: PathBuf,
+    process: process::Child,
+    ready: Ready,
+    dead: bool,
+}
+
+impl Child {
+    /// Address of its API.
+    pub(super) fn api(&self) -> &str {
+        &self.ready.api
+    }
+
+    /// Its process id.
+    pub(super) fn id(&self) -> u32 {
+        self.process.id()
+    }
+}
+
+/// The children that make up the cell. Dropping it stops them.
+pub(super) struct Cell {
+    plan: Plan,
+    children: Vec<Child>,
+}
+
+impl Cell {
+    /// Starts the first host, then the others side by side, and waits until all are ready.
+    pub(super) fn start(plan: Plan, stop: &AtomicBool) -> Result<Self, Error> {
+        let first = plan.spawn(0, &[])?.wait(stop)?;
+        let at = first.ready.cell.clone();
+        let mut cell = Self {
+            plan,
+            children: vec![first],
+        };
+        let starting: Vec<Result<Starting, Error>> = (1..cell.plan.hosts.len())
+            .map(|index| cell.plan.spawn(index, &at))
+            .collect();
+        for started in starting {
+            cell.children.push(started?.wait(stop)?);
+        }
+        Ok(cell)
+    }
+
+    /// All children, in the order of the plan.
+    pub(super) fn children(&self) -> impl Iterator<Item = &Child> {
+        self.children.iter()
+    }
+
+    /// Address of a host's API.
+    pub(super) fn api(&self, name: &str) -> Option<&str> {
+        self.children.iter().find(|child| child.name == name).map(Child::api)
+    }
+
+    /// Who died since the last look, in words.
+    pub(super) fn deaths(&mut self) -> Vec<String> {
+        let mut deaths = Vec::new();
+        for child in self.children.iter_mut().filter(|child| !child.dead) {
+            if let Ok(Some(status)) = child.process.try_wait() {
+                child.dead = true;
+                deaths.push(format!(
+                    "host {} {}; its log: {}",
+                    child.name,
+                    in_words(status),
+                    child.log.display()
+                ));
+            }
+        }
+        deaths
+    }
+
+    /// Starts the dead again, joined to all others.
+    pub(super) fn revive(&mut self, stop: &AtomicBool) -> Vec<Result<String, Error>> {
+        let mut ends = Vec::new();
+        for index in 0..self.children.len() {
+            if !self.children[index].dead {
+                continue;
+            }
+            let others = self
+                .children
+                .iter()
+                .enumerate()
+                .filter(|(other, child)| *other != index && !child.dead);
+            let connect: Vec<String> = others.flat_map(|(_, child)| child.ready.cell.clone()).collect();
+            let back = self
+                .plan
+                .spawn(index, &connect)
+                .and_then(|starting| starting.wait(stop));
+            ends.push(back.map(|child| {
+                let name = child.name.clone();
+                self.children[index] = child;
+                name
+            }));
+        }
+        ends
+    }
+
+    /// Stops the controllers, then the plant: each drains first.
+    pub(super) fn stop(&mut self) {
+        let (plant, controllers) = match self.children.split_first_mut() {
+            Some((plant, controllers)) => (plant, controllers),
+            None => return,
+        };
+        // All are told before one is waited for.
+        for child in controllers.iter_mut() {
+            drop(child.process.stdin.take());
+        }
+        for child in controllers.iter_mut() {
+            end(&mut child.process, STOP_TIME_MAX);
+        }
+        drop(plant.process.stdin.take());
+        end(&mut plant.process, STOP_TIME_MAX);
+        self.children.clear();
+    }
+}
+
+impl Drop for Cell {
+    fn drop(&mut self) {
+        self.stop();
+    }
+}
+
+/// Closes a process's standard input, waits, and kills it where that did not help.
+fn end(process: &mut process::Child, patience: Duration) {
+    drop(process.stdin.take());
+    let until = Instant::now() + patience;
+    while Instant::now() < until {
+        match process.try_wait() {
+            Ok(None) => std::thread::sleep(LOOK_EVERY),
+            // Ended, or not ours to wait for.
+            _ => return,
+        }
+    }
+    if matches!(process.try_wait(), Ok(None)) {
+        show::note(&format!("process {} did not stop in time and is killed", process.id()));
+        // It may have ended in between; that is as good.
+        let _ = process.kill();
+    }
+    let _ = process.wait();
+}
+
+fn in_words(status: ExitStatus) -> String {
+    match (status.code(), status.signal()) {
+        (Some(code), _) => format!("ended with code {code}"),
+        (None, Some(signal)) => format!("was killed by signal {signal}"),
+        (None, None) => "ended".to_owned(),
+    }
+}
+
+/// The last lines of a log.
+fn log_end(log: &Path) -> String {
+    let text = fs::read_to_string(log).unwrap_or_default();
+    let lines: Vec<&str> = text.lines().collect();
+    let skip = lines.len().saturating_sub(LOG_LINES);
+    lines[skip..]
+        .iter()
+        .fold(format!("; the end of {}:", log.display()), |text, line| {
+            text + "\n    " + line
+        })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Config;
+
+    #[test]
+    fn the_hosts_files_are_good_ones() {
+        let at = ["tcp/127.0.0.1:1".to_owned(), "tcp/127.0.0.1:2".to_owned()];
+        let plant = Config::parse(&host_file("plant", 0, &[], true), Path::new("host.toml")).expect("a good file");
+        assert_eq!((plant.io, plant.control), (true, false));
+        let a = Config::parse(&host_file("a", 8481, &at, false), Path::new("host.toml")).expect("a good file");
+        assert_eq!((a.io, a.control), (false, true));
+        assert_eq!(a.cell.connect, at);
+        assert_eq!(a.api_listen.port(), 8481);
+    }
+
+    #[test]
+    fn ends_are_told_in_words() {
+        assert_eq!(in_words(ExitStatus::from_raw(9)), "was killed by signal 9");
+        assert_eq!(in_words(ExitStatus::from_raw(256)), "ended with code 1");
+    }
+}

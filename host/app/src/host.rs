@@ -1,0 +1,130 @@
+//! A host's life as a process: check, start, say so, wait, drain, stop.
+//!
+//! ```text
+//! reading the file ─► starting ─► ready (one JSON line on stdout) ─► SIGTERM, SIGINT, parent gone ─► draining ─► stopped, 0
+//!        └ error, 1       └ error, 1                └ a part fails for good ─► stopped, 1
+//! ```
+//! Never: builds a room (that is `compose`).
+
+use std::{io::Read as _, time::Duration};
+
+use serde::{Deserialize, Serialize};
+use tokio::signal::unix::{SignalKind, signal};
+use tracing_subscriber::EnvFilter;
+
+use crate::{
+    cli::{HostArgs, LogFormat},
+    compose,
+    config::Config,
+    error::Error,
+    show,
+};
+
+/// Log lines where BUMPLESS_LOG says nothing: ours from info up, the bus's only when something is wrong.
+const LOG_DEFAULT: &str = "info,zenoh=warn,zenoh_transport=error,zenoh_link_commons=error";
+/// Tasks of the runtime get this long to end once everything is stopped.
+const RUNTIME_STOP_TIME_MAX: Duration = Duration::from_secs(2);
+
+/// What a host prints, as one line of JSON, once it has joined its cell and its API answers.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Ready {
+    /// Always true: a host that does not get ready says so on the error output, and ends.
+    pub(crate) ready: bool,
+    /// Its name.
+    pub(crate) host: String,
+    /// Address of its API.
+    pub(crate) api: String,
+    /// Where other hosts reach it: for their `connect`.
+    pub(crate) cell: Vec<String>,
+}
+
+/// Runs a host until it is told to stop.
+pub(crate) fn run(args: &HostArgs) -> Result<(), Error> {
+    let config = Config::read(&args.config, args.data.as_deref())?;
+    if args.check {
+        let roles = match (config.io, config.control) {
+            (true, true) => "io and control",
+            (true, false) => "io",
+            _ => "control",
+        };
+        let buses = config.buses.buses.len();
+        return show::line(&format!(
+            "{}: good: host {} of cell {}, {roles}, {buses} buses, API on {}",
+            config.path.display(),
+            config.host,
+            config.cell.cell,
+            config.api_listen
+        ));
+    }
+    log(args.log_format);
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .enable_all()
+        .thread_name("async")
+        .build()
+        .map_err(|error| Error::start("the async runtime", error))?;
+    let end = runtime.block_on(live(config, args.until_stdin_closes));
+    runtime.shutdown_timeout(RUNTIME_STOP_TIME_MAX);
+    end
+}
+
+/// Log lines go to the error output; the standard output is for the line that says "ready".
+fn log(format: LogFormat) {
+    let filter = EnvFilter::try_from_env("BUMPLESS_LOG").unwrap_or_else(|_| EnvFilter::new(LOG_DEFAULT));
+    let lines = tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_writer(std::io::stderr);
+    // Only one log can be set; whoever set one before (a test) keeps it.
+    let _ = match format {
+        LogFormat::Text => lines.try_init(),
+        LogFormat::Json => lines.json().try_init(),
+    };
+}
+
+async fn live(config: Config, until_stdin_closes: bool) -> Result<(), Error> {
+    // Before anything is started, so that no signal is missed.
+    let mut terminate = signal(SignalKind::terminate()).map_err(|error| Error::start("the signal handler", error))?;
+    let mut interrupt = signal(SignalKind::interrupt()).map_err(|error| Error::start("the signal handler", error))?;
+    let parent_gone = parent_gone(until_stdin_closes)?;
+
+    let host = config.host.clone();
+    let mut running = compose::run(config).await?;
+    let ready = Ready {
+        ready: true,
+        host: host.to_string(),
+        api: format!("http://{}", running.api),
+        cell: running.locators.clone(),
+    };
+    show::line(&serde_json::to_string(&ready).map_err(|error| Error::start("the line that says ready", error))?)?;
+
+    let end = tokio::select! {
+        _ = terminate.recv() => { tracing::info!("SIGTERM: draining"); Ok(()) }
+        _ = interrupt.recv() => { tracing::info!("SIGINT: draining"); Ok(()) }
+        () = parent_gone => { tracing::info!("the parent is gone: draining"); Ok(()) }
+        error = running.failed() => Err(error),
+    };
+    running.stop().await;
+    tracing::info!("stopped");
+    end
+}
+
+/// Ends when the standard input does. A thread waits, for the standard input cannot be waited for otherwise.
+fn parent_gone(wanted: bool) -> Result<impl Future<Output = ()>, Error> {
+    let (gone, seen) = tokio::sync::oneshot::channel();
+    if wanted {
+        let wait = move || {
+            let mut piece = [0; 256];
+            while matches!(std::io::stdin().read(&mut piece), Ok(1..)) {}
+            // The host may have stopped for another reason.
+            let _ = gone.send(());
+        };
+        std::thread::Builder::new()
+            .name("parent".to_owned())
+            .spawn(wait)
+            .map_err(|error| Error::start("the watch on the parent", error))?;
+    }
+    Ok(async move {
+        if !wanted || seen.await.is_err() {
+            std::future::pending::<()>().await;
+        }
+    })
+}
