@@ -1,0 +1,101 @@
+//! `cargo xtask bench <name>`: what Bumpless promises, measured on this machine and judged.
+//!
+//! Owns the command line. Every bench prints its conditions, then one figure per line; a figure whose bound does not hold
+//! makes the exit code 1, a bench that could not run makes it 2.
+//! Never: a timing that a test depends on; benches are run by people and by the release's checklist.
+
+mod actuator;
+mod call;
+mod conditions;
+mod error;
+mod failover;
+mod faults;
+mod history;
+mod law;
+mod local;
+mod peer;
+mod report;
+mod spread;
+mod stall;
+mod step;
+
+use std::process::ExitCode;
+
+use clap::{Args, Parser, Subcommand};
+
+use crate::{conditions::Conditions, error::Error, report::Report};
+
+/// Measures what Bumpless promises.
+#[derive(Parser)]
+#[command(name = "cargo xtask bench", version)]
+struct CommandLine {
+    #[command(subcommand)]
+    bench: Bench,
+    #[command(flatten)]
+    options: Options,
+}
+
+#[derive(Subcommand)]
+enum Bench {
+    /// Kills and pauses of replicas and owners: lost cycles, pauses, double writes, integral of the absolute error.
+    Failover,
+    /// A remote step over loopback TCP between processes, on the bus and through the REST API.
+    Call,
+    /// A step native and in the sandbox, and the cycle of a loop whose owner, replica and I/O are one process.
+    Step,
+    /// The other process of `call`.
+    #[command(hide = true)]
+    CallPeer {
+        /// Digest of the component to step.
+        component: std::path::PathBuf,
+    },
+}
+
+/// How a bench is run.
+#[derive(Debug, Clone, Copy, Args)]
+pub(crate) struct Options {
+    /// One JSON line per figure on standard output; the conditions go to standard error.
+    #[arg(long, global = true)]
+    json: bool,
+    /// Smaller counts, the same checks.
+    #[arg(long, global = true)]
+    quick: bool,
+}
+
+impl Options {
+    /// `full`, or `quick` where less is asked for.
+    const fn count(self, full: u64, quick: u64) -> u64 {
+        if self.quick { quick } else { full }
+    }
+}
+
+fn main() -> ExitCode {
+    let CommandLine { bench, options } = CommandLine::parse();
+    match run(&bench, options) {
+        Ok(true) => ExitCode::SUCCESS,
+        Ok(false) => ExitCode::FAILURE,
+        Err(error) => {
+            report::failed(&error);
+            ExitCode::from(2)
+        }
+    }
+}
+
+/// Says whether every bound holds.
+fn run(bench: &Bench, options: Options) -> Result<bool, Error> {
+    let name = match bench {
+        Bench::Call => "call",
+        Bench::Failover => "failover",
+        Bench::Step => "step",
+        Bench::CallPeer { component } => return peer::run(component).map(|()| true),
+    };
+    let conditions = Conditions::now(name, options.quick);
+    let mut report = Report::begin(&conditions, options.json);
+    match bench {
+        Bench::Call => call::run(options, &mut report)?,
+        Bench::Failover => failover::run(options, &mut report)?,
+        Bench::Step => step::run(options, &mut report)?,
+        Bench::CallPeer { .. } => {}
+    }
+    Ok(report.end())
+}
