@@ -160,7 +160,7 @@ struct Source {
 }
 
 /// The workspace's root, as it was when this tool was built.
-fn workspace_root() -> &'static Path {
+pub(crate) fn workspace_root() -> &'static Path {
     let own = Path::new(env!("CARGO_MANIFEST_DIR"));
     own.parent().unwrap_or(own)
 }
@@ -281,7 +281,7 @@ fn sources(metadata: &Metadata) -> Vec<Source> {
 }
 
 /// Adds the wasm target through rustup where the compiler does not have it.
-fn ensure_target() -> Result<(), Error> {
+pub(crate) fn ensure_target() -> Result<(), Error> {
     let text = output(
         "rustc",
         command("rustc").args(["--print", "target-libdir", "--target", TARGET]),

@@ -2,4 +2,12 @@
 //!
 //! Never: a part of the product.
 
+pub mod check;
 pub mod components;
+pub mod product;
+
+mod deny;
+mod error;
+mod run;
+
+pub use error::Error;

@@ -3,6 +3,7 @@
 use std::process::ExitCode;
 
 use clap::Parser;
+use xtask::{Error, check, components, product};
 
 /// Sets up, builds and checks Bumpless.
 #[derive(Parser)]
@@ -10,11 +11,35 @@ use clap::Parser;
 enum Command {
     /// Builds the controllers and the test guests into components under target/components.
     Components,
+    /// Sets up what is missing and runs everything that has to hold: format, dependencies, lints, build, tests, documentation.
+    Test {
+        /// Leaves out what takes minutes: the dependency check, end-to-end tests, documentation.
+        #[arg(long)]
+        fast: bool,
+    },
+    /// Builds everything and starts a cell on this machine: a simulated plant and three controller hosts.
+    Demo {
+        /// For `bumpless demo`: see `bumpless demo --help`.
+        #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
+        arguments: Vec<String>,
+    },
+    /// Measures, with optimisation: `cargo xtask bench NAME [arguments]`; without a name it lists what there is.
+    Bench {
+        /// The bench and its arguments.
+        #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
+        arguments: Vec<String>,
+    },
+    /// Writes docs/openapi.json from the code.
+    Openapi,
 }
 
 fn main() -> ExitCode {
     let done = match Command::parse() {
-        Command::Components => xtask::components::run(),
+        Command::Components => components::run().map_err(Error::from),
+        Command::Test { fast } => check::test(fast),
+        Command::Demo { arguments } => product::demo(&arguments),
+        Command::Bench { arguments } => product::bench(&arguments),
+        Command::Openapi => product::openapi(),
     };
     match done {
         Ok(()) => ExitCode::SUCCESS,

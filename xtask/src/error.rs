@@ -1,0 +1,45 @@
+//! Why the project's own tool failed.
+
+use std::{io, path::PathBuf};
+
+use crate::components;
+
+/// Why a command failed.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The components.
+    #[error(transparent)]
+    Components(#[from] components::Error),
+    /// A program is not there or cannot be run.
+    #[error("{program} cannot be run: install it and put it on the path")]
+    Program {
+        /// Its name.
+        program: String,
+        /// What the system says.
+        source: io::Error,
+    },
+    /// A program ended badly; what it had to say stands above.
+    #[error("`{command}` ended with {status}")]
+    Failed {
+        /// The command line.
+        command: String,
+        /// How it ended.
+        status: String,
+    },
+    /// A file or folder.
+    #[error("{path}: cannot be written")]
+    File {
+        /// Which.
+        path: PathBuf,
+        /// What the system says.
+        source: io::Error,
+    },
+    /// A step of the checks failed.
+    #[error("the step {step:?} failed")]
+    Step {
+        /// Its name.
+        step: &'static str,
+        /// Why.
+        source: Box<Error>,
+    },
+}

@@ -1,0 +1,50 @@
+//! `cargo xtask demo`, `bench` and `openapi`: builds what is needed, then runs the product.
+
+use std::process::Stdio;
+
+use crate::{
+    Error, components,
+    run::{cargo, program, run, say, target_folder},
+};
+
+/// Builds components and binary, and starts a cell on this machine; arguments go to `bumpless demo`.
+///
+/// # Errors
+/// What does not build, or how the demonstration ended.
+pub fn demo(arguments: &[String]) -> Result<(), Error> {
+    say("building the components and the host…");
+    let folder = components::build()?;
+    run(&mut cargo("build --package bumpless-app"))?;
+    let binary = target_folder().join("debug/bumpless");
+    run(program(binary)
+        .args(["demo", "--components"])
+        .arg(folder)
+        .args(arguments)
+        .stdin(Stdio::inherit()))
+}
+
+/// Builds everything with optimisation and runs a bench; arguments go to it.
+///
+/// # Errors
+/// What does not build, or a bound that does not hold.
+pub fn bench(arguments: &[String]) -> Result<(), Error> {
+    components::build()?;
+    // In one command, so that one set of features and one build of the dependencies serve both.
+    run(&mut cargo(
+        "build --release --package bumpless-app --package bumpless-bench",
+    ))?;
+    run(cargo("run --release --quiet --package bumpless-bench --").args(arguments))
+}
+
+/// Writes `docs/openapi.json` from the code.
+///
+/// # Errors
+/// What does not build.
+pub fn openapi() -> Result<(), Error> {
+    run(
+        cargo("test --package bumpless-api --lib --quiet the_checked_in_document_is_the_code")
+            .env("UPDATE_EXPECT", "1"),
+    )?;
+    say("docs/openapi.json is what the code says");
+    Ok(())
+}
