@@ -22,6 +22,9 @@ use crate::{
 
 /// Log lines where BUMPLESS_LOG says nothing: ours from info up, the bus's only when something is wrong.
 const LOG_DEFAULT: &str = "info,zenoh=warn,zenoh_transport=error,zenoh_link_commons=error";
+/// The cycle's path crosses the bus's threads as well as the loops' own, so the whole process goes before what else the
+/// machine does; what compiles goes behind it by itself.
+const NICE: i32 = -10;
 /// Tasks of the runtime get this long to end once everything is stopped.
 const RUNTIME_STOP_TIME_MAX: Duration = Duration::from_secs(2);
 
@@ -57,6 +60,10 @@ pub(crate) fn run(args: &HostArgs) -> Result<(), Error> {
         ));
     }
     log(args.log_format);
+    // Before any thread is made, so that all inherit it. A process without the right to it runs as it is.
+    if let Err(error) = rustix::process::setpriority_process(None, NICE) {
+        tracing::info!(%error, "the host runs at the usual priority; CAP_SYS_NICE would put its cycles before other work");
+    }
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
         .thread_name("async")

@@ -17,6 +17,8 @@ use crate::{calls::Calls, event::Event, home::Home, seat::Seat, shared::Shared};
 
 /// Longest sleep, in ns: a worker with nothing to do looks around this often.
 const NAP_NS_MAX: u64 = 1_000_000_000;
+/// Events handled before timers are looked at again.
+const EVENTS_BEFORE_TIMERS_MAX: usize = 64;
 /// Time between probes, in ns.
 const PROBE_NS: u64 = 100_000_000;
 
@@ -66,7 +68,16 @@ impl Worker {
         if self.index == 0 {
             self.at(self.shared.now_ns(), Timer::Probe);
         }
-        loop {
+        'run: loop {
+            // What has arrived goes before what is late: after a stall of the machine the commit that a timer would miss
+            // lies in the inbox already, and a takeover for it would be noise. Bounded, so that timers get their turn.
+            for _ in 0..EVENTS_BEFORE_TIMERS_MAX {
+                match self.inbox.try_recv() {
+                    Ok(Event::Stop) => break 'run,
+                    Ok(event) => self.handle(event),
+                    Err(_) => break,
+                }
+            }
             let now_ns = self.fire();
             let next_ns = self
                 .timers
