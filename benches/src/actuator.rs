@@ -41,7 +41,11 @@ pub(crate) fn felt(
         ..Felt::default()
     };
     // A pause belongs to the part in which it ended.
-    for gap in journal.gaps(point, 0).iter().filter(|gap| (from_ns..to_ns).contains(&gap.to_ns)) {
+    for gap in journal
+        .gaps(point, 0)
+        .iter()
+        .filter(|gap| (from_ns..to_ns).contains(&gap.to_ns))
+    {
         let stalled_ns = stalls.within_ns(gap.from_ns, gap.to_ns);
         let own_ns = gap.ns().saturating_sub(stalled_ns).max(gap.ns().min(period_ns));
         let periods = |ns: u64| ns as f64 / period_ns as f64;
@@ -56,6 +60,15 @@ pub(crate) fn felt(
 }
 
 impl Felt {
+    /// Takes what another part, or another actuator, felt.
+    pub(crate) const fn join(&mut self, other: &Self) {
+        self.writes += other.writes;
+        self.lost_raw += other.lost_raw;
+        self.lost += other.lost;
+        self.gap_raw = self.gap_raw.max(other.gap_raw);
+        self.gap = self.gap.max(other.gap);
+    }
+
     /// Tells the figures under `name`, each with what the machine's stalls do not explain first, and judges those.
     pub(crate) fn tell(&self, report: &mut Report, name: &str, lost: Bound, gap: Bound) {
         report.told(&format!("{name}.cycles"), self.writes as f64, "cycles");
@@ -78,7 +91,11 @@ pub(crate) fn tell_writers(report: &mut Report, bench: &str, journal: &Journal) 
         "writes",
         Bound::AtMost(0.0),
     );
-    report.told(&format!("{bench}.refused_writes"), journal.refused.len() as f64, "writes");
+    report.told(
+        &format!("{bench}.refused_writes"),
+        journal.refused.len() as f64,
+        "writes",
+    );
     report.figure(
         &format!("{bench}.journal_lines_dropped"),
         journal.dropped as f64,
@@ -102,7 +119,10 @@ mod tests {
             term: 1,
             seq,
         };
-        Journal { writes: writes.iter().map(write).collect(), ..Journal::default() }
+        Journal {
+            writes: writes.iter().map(write).collect(),
+            ..Journal::default()
+        }
     }
 
     #[test]
@@ -111,15 +131,34 @@ mod tests {
         let journal = journal(&[(100, 1), (200, 2), (400, 4), (570, 5), (600, 6)]);
         let quiet = Stalls::of_times(&[]);
         let all = felt(&journal, "p", 100, (0, 1000), &quiet);
-        assert_eq!(all, Felt { writes: 5, lost_raw: 1, lost: 1, gap_raw: 2.0, gap: 2.0 });
+        assert_eq!(
+            all,
+            Felt {
+                writes: 5,
+                lost_raw: 1,
+                lost: 1,
+                gap_raw: 2.0,
+                gap: 2.0
+            }
+        );
         let short = Stalls::of_times(&[(300, 340)]);
         let some = felt(&journal, "p", 100, (0, 1000), &short);
         assert_eq!((some.lost_raw, some.lost, some.gap_raw), (1, 1, 2.0));
-        assert!((some.gap - 1.7).abs() < 1e-9, "the late one is the longest now: {}", some.gap);
+        assert!(
+            (some.gap - 1.7).abs() < 1e-9,
+            "the late one is the longest now: {}",
+            some.gap
+        );
         let long = Stalls::of_times(&[(210, 390), (400, 490)]);
         assert_eq!(
             felt(&journal, "p", 100, (0, 1000), &long),
-            Felt { writes: 5, lost_raw: 1, lost: 0, gap_raw: 2.0, gap: 1.0 }
+            Felt {
+                writes: 5,
+                lost_raw: 1,
+                lost: 0,
+                gap_raw: 2.0,
+                gap: 1.0
+            }
         );
         assert_eq!(felt(&journal, "p", 100, (580, 1000), &quiet).gap_raw, 0.3);
     }

@@ -3,7 +3,7 @@
 //! ```text
 //! caller ─► worker ─► bus ═══ TCP ═══ bus ─► worker: step ─► bus ═══ TCP ═══ bus ─► worker ─► caller
 //! ```
-//! Beside it, in the same run, what bare TCP takes for messages of that size: the floor.
+//! Beside it, in the same run, what bare TCP takes for messages of that size: the floor; then the same through the REST API.
 
 use std::{
     io::{BufRead, BufReader, Read, Write},
@@ -25,6 +25,7 @@ use crate::{
     law,
     peer::{self, ECHO_BYTES, PEER, Ready},
     report::{Bound, Report},
+    rest,
     spread::Spread,
     stall::Watch,
 };
@@ -147,6 +148,8 @@ pub(crate) fn run(options: Options, report: &mut Report) -> Result<(), Error> {
     );
     runtime.block_on(session.close());
     loops.stop();
+    drop(other);
+    rest::run(options, report)?;
     watch.finish().tell(report, "call");
     Ok(())
 }
@@ -163,7 +166,12 @@ fn cpu_s(pid: &str) -> f64 {
     let text = std::fs::read_to_string(format!("/proc/{pid}/stat")).unwrap_or_default();
     // The name in brackets may hold blanks; the fields are counted after it.
     let fields = text.rsplit(')').next().unwrap_or_default().split_whitespace();
-    fields.skip(11).take(2).filter_map(|field| field.parse::<f64>().ok()).sum::<f64>() / 100.0
+    fields
+        .skip(11)
+        .take(2)
+        .filter_map(|field| field.parse::<f64>().ok())
+        .sum::<f64>()
+        / 100.0
 }
 
 fn bare_tcp(echo: &str, rounds: u64) -> Result<Spread, Error> {
@@ -189,7 +197,10 @@ fn vitals(host: HostId, ready: Digest) -> Vitals {
         host,
         seq: 1,
         started_at_ms: 0,
-        roles: Roles { io: false, control: true },
+        roles: Roles {
+            io: false,
+            control: true,
+        },
         api: None,
         cpu: 0.0,
         cpu_process: 0.0,
@@ -230,21 +241,39 @@ struct Caller<'a> {
 impl<'a> Caller<'a> {
     fn new(loops: &'a Loops, digest: Digest, frames: Vec<Frame>, state: Arc<[u8]>) -> Self {
         let (sender, answers) = bounded(usize::try_from(IN_FLIGHT).unwrap_or(1));
-        Self { loops, digest, frames, state, sender, answers, turn: 0 }
+        Self {
+            loops,
+            digest,
+            frames,
+            state,
+            sender,
+            answers,
+            turn: 0,
+        }
     }
 
     fn ask(&mut self) -> Result<(), Error> {
         self.turn = (self.turn + 1) % self.frames.len().max(1);
-        let Some(frame) = self.frames.get(self.turn).cloned() else { return Ok(()) };
+        let Some(frame) = self.frames.get(self.turn).cloned() else {
+            return Ok(());
+        };
         let (sender, asked) = (self.sender.clone(), Instant::now());
         // There is a place for every call on its way.
         let reply = Box::new(move |end| drop(sender.try_send((asked, end))));
         let state = Arc::clone(&self.state);
-        Ok(self.loops.call(self.digest, Strategy::Latency, frame, state, LIMIT_NS, reply)?)
+        Ok(self
+            .loops
+            .call(self.digest, Strategy::Latency, frame, state, LIMIT_NS, reply)?)
     }
 
     fn run(&mut self, calls: u64, in_flight: u64) -> Result<Part, Error> {
-        let mut part = Part { calls, failed: 0, seen: Spread::new(), at_worker: Spread::new(), rate: 0.0 };
+        let mut part = Part {
+            calls,
+            failed: 0,
+            seen: Spread::new(),
+            at_worker: Spread::new(),
+            rate: 0.0,
+        };
         let started = Instant::now();
         for _ in 0..in_flight {
             self.ask()?;
@@ -259,7 +288,8 @@ impl<'a> Caller<'a> {
             }
             match end {
                 Ok(end) if end.answer.from.as_str() == PEER => {
-                    part.seen.add(u64::try_from(asked.elapsed().as_nanos()).unwrap_or(u64::MAX));
+                    part.seen
+                        .add(u64::try_from(asked.elapsed().as_nanos()).unwrap_or(u64::MAX));
                     part.at_worker.add(end.total_ns);
                 }
                 _ => part.failed += 1,

@@ -43,7 +43,11 @@ impl Conditions {
             cores: std::thread::available_parallelism().map_or(0, usize::from),
             kernel: line_of("/proc/sys/kernel/osrelease").unwrap_or_else(unknown),
             compiler: compiler.filter(|text| !text.is_empty()).unwrap_or_else(unknown),
-            build: if cfg!(debug_assertions) { "dev: figures mean nothing" } else { "release" },
+            build: if cfg!(debug_assertions) {
+                "dev: figures mean nothing"
+            } else {
+                "release"
+            },
             load: line_of("/proc/loadavg").unwrap_or_else(unknown),
         }
     }
@@ -70,7 +74,11 @@ fn date(unix_s: u64) -> String {
     let day_of_year = day_of_era - (365 * year_of_era + year_of_era / 4 - year_of_era / 100);
     let shifted_month = (5 * day_of_year + 2) / 153;
     let day = day_of_year - (153 * shifted_month + 2) / 5 + 1;
-    let month = if shifted_month < 10 { shifted_month + 3 } else { shifted_month - 9 };
+    let month = if shifted_month < 10 {
+        shifted_month + 3
+    } else {
+        shifted_month - 9
+    };
     let year = era * 400 + year_of_era + u64::from(month <= 2);
     let (hour, minute) = (second / 3600, second / 60 % 60);
     format!("{year}-{month:02}-{day:02} {hour:02}:{minute:02} UTC")

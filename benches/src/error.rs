@@ -41,6 +41,9 @@ pub(crate) enum Error {
     /// A loop's specification does not fit its component.
     #[error("the loop does not fit the component")]
     Spec(#[from] bumpless_core::spec::SpecError),
+    /// Too few cores.
+    #[error("this process may use {0} cores; the bench needs 2, to load one and leave the others alone")]
+    Cores(usize),
     /// The cell of processes.
     #[error("the cell")]
     Cell(#[from] bumpless_tests::Error),

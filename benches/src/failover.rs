@@ -58,17 +58,30 @@ pub(crate) fn run(options: Options, report: &mut Report) -> Result<(), Error> {
             fault(&mut faults)?;
         }
         let to_ns = faults.wait_period();
-        parts.push(Part { name, faults: count, from_ns, to_ns });
+        parts.push(Part {
+            name,
+            faults: count,
+            from_ns,
+            to_ns,
+        });
     }
     // As long as the longest part, so that each finds an undisturbed one of its own length in it.
     let periods = parts.iter().map(Part::periods).max().unwrap_or(1);
-    report.progress(&format!("undisturbed: {} s", periods * Faults::period_ns() / 1_000_000_000));
+    report.progress(&format!(
+        "undisturbed: {} s",
+        periods * Faults::period_ns() / 1_000_000_000
+    ));
     let from_ns = faults.wait_period();
     let mut to_ns = from_ns;
     for _ in 0..periods {
         to_ns = faults.wait_period();
     }
-    let undisturbed = Part { name: "undisturbed", faults: 0, from_ns, to_ns };
+    let undisturbed = Part {
+        name: "undisturbed",
+        faults: 0,
+        from_ns,
+        to_ns,
+    };
     let setpoints_missed = faults.stop_profile();
     // The journal reaches the disk within a quarter of a second.
     std::thread::sleep(std::time::Duration::from_millis(500));
@@ -82,14 +95,17 @@ pub(crate) fn run(options: Options, report: &mut Report) -> Result<(), Error> {
             if part.faults > 0 {
                 report.told(&format!("{prefix}.faults"), part.faults as f64, "faults");
             }
-            felt(&journal, of.point, of.period_ns, (part.from_ns, part.to_ns), &stalls).tell(report, &prefix, lost, gap);
+            felt(&journal, of.point, of.period_ns, (part.from_ns, part.to_ns), &stalls)
+                .tell(report, &prefix, lost, gap);
             let records = faults.history.between(name, part.from_ns, part.to_ns);
             let count = |is: fn(&crate::history::Seen) -> bool| records.iter().filter(|r| is(r)).count() as f64;
             report.told(&format!("{prefix}.cycles_hedged"), count(|r| r.hedged), "cycles");
             report.told(&format!("{prefix}.takeovers"), count(|r| r.took_over), "takeovers");
             if part.faults > 0 {
                 let length_ns = part.periods() * Faults::period_ns();
-                let equal = faults.history.between(name, undisturbed.from_ns, undisturbed.from_ns + length_ns);
+                let equal = faults
+                    .history
+                    .between(name, undisturbed.from_ns, undisturbed.from_ns + length_ns);
                 let without = iae(&equal);
                 let change = 100.0 * (iae(&records) - without).abs() / without;
                 report.told(&format!("{prefix}.iae_change"), change, "%");

@@ -36,8 +36,16 @@ pub(crate) struct LoopOf {
 
 /// The loops of the bench.
 pub(crate) const LOOPS: [LoopOf; 2] = [
-    LoopOf { label: "10hz", period_ns: 100_000_000, point: "plant.0.out" },
-    LoopOf { label: "100hz", period_ns: 10_000_000, point: "plant.1.out" },
+    LoopOf {
+        label: "10hz",
+        period_ns: 100_000_000,
+        point: "plant.0.out",
+    },
+    LoopOf {
+        label: "100hz",
+        period_ns: 10_000_000,
+        point: "plant.1.out",
+    },
 ];
 /// The controller hosts of a harness cell.
 const CONTROLLERS: [&str; 3] = ["a", "b", "c"];
@@ -94,7 +102,14 @@ impl Faults {
         }
         cell.wait_joined()?;
         let profile = Profile::start(api, names.clone())?;
-        Ok(Self { cell, history, names, clock: Clock::start(), profile: Some(profile), turn: 0 })
+        Ok(Self {
+            cell,
+            history,
+            names,
+            clock: Clock::start(),
+            profile: Some(profile),
+            turn: 0,
+        })
     }
 
     /// Waits for the next beginning of the setpoint's period; gives that time, in ns since 1970.
@@ -179,8 +194,9 @@ impl Faults {
             let place = self.history.place();
             self.cell.plant.api().move_owner(fast, &wanted)?;
             let what = format!("{wanted} to own {fast}");
-            self.history
-                .wait(&what, place, |record| record.loop_name == *fast && record.owner == wanted)?;
+            self.history.wait(&what, place, |record| {
+                record.loop_name == *fast && record.owner == wanted
+            })?;
         }
         Ok(wanted)
     }
@@ -221,7 +237,10 @@ impl Profile {
                         if stop_there.load(Ordering::Relaxed) {
                             return;
                         }
-                        std::thread::sleep(due.saturating_duration_since(Instant::now()).min(Duration::from_millis(50)));
+                        std::thread::sleep(
+                            due.saturating_duration_since(Instant::now())
+                                .min(Duration::from_millis(50)),
+                        );
                     }
                     for name in &names {
                         if api.setpoint(name, setpoint).is_err() {
@@ -232,13 +251,21 @@ impl Profile {
                 }
             })
             .map_err(Error::io("the profile's thread cannot be started"))?;
-        Ok(Self { stop, missed, started, thread })
+        Ok(Self {
+            stop,
+            missed,
+            started,
+            thread,
+        })
     }
 }
 
 /// Two loop names for which the hosts have the same rank.
 fn names_of_one_rank() -> Result<[String; 2], Error> {
-    let hosts = CONTROLLERS.into_iter().map(HostId::new).collect::<Result<Vec<_>, _>>()?;
+    let hosts = CONTROLLERS
+        .into_iter()
+        .map(HostId::new)
+        .collect::<Result<Vec<_>, _>>()?;
     let slow = "slow";
     let wanted = place::rank(&LoopId::new(slow)?, &hosts);
     for number in 0.. {

@@ -32,6 +32,7 @@ pub(crate) struct Seen {
     pub(crate) seq: u64,
     /// When the inputs were frozen, ns since 1970 on the plant's clock.
     pub(crate) at_ns: u64,
+    pub(crate) digest: String,
     pub(crate) owner: String,
     pub(crate) stepped_by: String,
     pub(crate) setpoint: f64,
@@ -55,6 +56,7 @@ impl Seen {
             loop_name: text("loop")?,
             seq: record["seq"].as_u64()?,
             at_ns: record["at_unix_us"].as_u64()? * 1000,
+            digest: text("digest")?,
             owner: text("owner")?,
             stepped_by: text("stepped_by")?,
             setpoint: record["setpoint"].as_f64()?,
@@ -94,7 +96,10 @@ impl History {
                 .spawn(move || read(&feed, &shared))
                 .map_err(Error::io("the feed's thread cannot be started"))?
         };
-        Ok(Self { shared, thread: Some(thread) })
+        Ok(Self {
+            shared,
+            thread: Some(thread),
+        })
     }
 
     /// How many records there are now; a place to look from later.
@@ -121,7 +126,10 @@ impl History {
                 from = seen.len();
             }
             if started.elapsed() > PATIENCE || self.shared.ended.load(Ordering::Relaxed) {
-                return Err(Error::Waited { what: what.to_owned(), seconds: started.elapsed().as_secs() });
+                return Err(Error::Waited {
+                    what: what.to_owned(),
+                    seconds: started.elapsed().as_secs(),
+                });
             }
             std::thread::sleep(LOOK);
         }
@@ -131,7 +139,9 @@ impl History {
     pub(crate) fn wait_steps(&self, loops: &[&str], host: &str, place: usize) -> Result<(), Error> {
         for name in loops {
             let what = format!("a step of {name} on {host}");
-            self.wait(&what, place, |record| record.loop_name == *name && record.stepped_by == host)?;
+            self.wait(&what, place, |record| {
+                record.loop_name == *name && record.stepped_by == host
+            })?;
         }
         Ok(())
     }
@@ -169,7 +179,9 @@ fn read(feed: &Feed, shared: &Shared) {
                 }
             }
             "lost" => {
-                shared.lost.fetch_add(event.data["records"].as_u64().unwrap_or(1), Ordering::Relaxed);
+                shared
+                    .lost
+                    .fetch_add(event.data["records"].as_u64().unwrap_or(1), Ordering::Relaxed);
             }
             _ => {}
         }
@@ -198,12 +210,15 @@ mod tests {
     #[test]
     fn a_record_is_read_from_the_feed() {
         let record = json!({
-            "loop": "l", "term": 2, "seq": 17, "at_unix_us": 5, "owner": "a", "stepped_by": "b", "setpoint": 40.0,
+            "loop": "l", "term": 2, "seq": 17, "at_unix_us": 5, "digest": "d", "owner": "a", "stepped_by": "b", "setpoint": 40.0,
             "measurement": 39.0,
             "events": [{"kind": "hedged", "replica": "c"}, {"kind": "revised", "bump_percent": 0.01}],
         });
         let seen = Seen::of(&record);
-        assert_eq!(seen.as_ref().map(|s| (s.seq, s.at_ns, s.hedged, s.took_over)), Some((17, 5000, true, false)));
+        assert_eq!(
+            seen.as_ref().map(|s| (s.seq, s.at_ns, s.hedged, s.took_over)),
+            Some((17, 5000, true, false))
+        );
         assert_eq!(seen.and_then(|s| s.bump_percent), Some(0.01));
         assert!(Seen::of(&json!({"loop": "l"})).is_none());
     }
@@ -214,6 +229,7 @@ mod tests {
             loop_name: "l".to_owned(),
             seq: 1,
             at_ns,
+            digest: String::new(),
             owner: String::new(),
             stepped_by: String::new(),
             setpoint: 40.0,
@@ -223,7 +239,11 @@ mod tests {
             bump_percent: None,
             rolled_back: false,
         };
-        let records = [record(1_000_000_000, 38.0), record(2_000_000_000, 42.0), record(4_000_000_000, 40.0)];
+        let records = [
+            record(1_000_000_000, 38.0),
+            record(2_000_000_000, 42.0),
+            record(4_000_000_000, 40.0),
+        ];
         assert_eq!(iae(&records), 2.0 + 2.0);
         assert!(iae(&[]).is_nan());
     }

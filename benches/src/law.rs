@@ -22,7 +22,11 @@ pub(crate) fn component_path(name: &str) -> Result<PathBuf, Error> {
     let path = xtask::components::build()
         .map_err(Error::Components)?
         .join(format!("{name}.wasm"));
-    if path.is_file() { Ok(path) } else { Err(Error::Missing(path)) }
+    if path.is_file() {
+        Ok(path)
+    } else {
+        Err(Error::Missing(path))
+    }
 }
 
 /// A component of this repository, prepared.
@@ -50,7 +54,11 @@ pub(crate) fn frames(prepared: &Prepared) -> Vec<Frame> {
             };
             // Like a loop with two points: the measurement and the actuator. Other ports are not connected.
             let readings = prepared.descriptor().ports.iter().map(|port| {
-                if port.required { reading(port.direction) } else { Reading::unconnected() }
+                if port.required {
+                    reading(port.direction)
+                } else {
+                    Reading::unconnected()
+                }
             });
             Frame {
                 cycle: Cycle {
@@ -110,7 +118,11 @@ pub(crate) const fn memory() -> Memory {
 /// A first state of a component with its default parameters.
 pub(crate) fn first_state(instance: &mut bumpless_engine::Instance, limit_ns: u64) -> Result<Vec<u8>, Error> {
     let descriptor = instance.prepared().descriptor();
-    let parameters: Vec<f64> = descriptor.parameters.iter().map(|parameter| parameter.default).collect();
+    let parameters: Vec<f64> = descriptor
+        .parameters
+        .iter()
+        .map(|parameter| parameter.default)
+        .collect();
     let track = vec![SETPOINT; descriptor.outputs().count()];
     Ok(instance.start(&parameters, &track, limit_ns)?)
 }
@@ -131,7 +143,10 @@ mod tests {
         for (frame, sample) in frames(&prepared).iter().zip(samples()) {
             let effects = instance.step(frame, &state, 1_000_000_000).unwrap();
             let output = native.step(&tuning(), &sample);
-            assert_eq!(effects.writes.first().map(|(_, value)| value.to_bits()), Some(output.to_bits()));
+            assert_eq!(
+                effects.writes.first().map(|(_, value)| value.to_bits()),
+                Some(output.to_bits())
+            );
             state = effects.state;
         }
     }

@@ -56,9 +56,21 @@ struct Setting {
 }
 
 const SETTINGS: [Setting; 3] = [
-    Setting { name: "one_1khz", loops: 1, period_ns: 1_000_000 },
-    Setting { name: "one_100hz", loops: 1, period_ns: 10_000_000 },
-    Setting { name: "200_at_100hz", loops: 200, period_ns: 10_000_000 },
+    Setting {
+        name: "one_1khz",
+        loops: 1,
+        period_ns: 1_000_000,
+    },
+    Setting {
+        name: "one_100hz",
+        loops: 1,
+        period_ns: 10_000_000,
+    },
+    Setting {
+        name: "200_at_100hz",
+        loops: 200,
+        period_ns: 10_000_000,
+    },
 ];
 
 /// Runs every setting and tells its figures.
@@ -77,7 +89,11 @@ pub(crate) fn run(options: Options, report: &mut Report, engine: &Engine) -> Res
 }
 
 fn one(report: &mut Report, engine: &Engine, setting: &Setting, time: Duration) -> Result<(), Error> {
-    let &Setting { name, loops: count, period_ns } = setting;
+    let &Setting {
+        name,
+        loops: count,
+        period_ns,
+    } = setting;
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(1)
         .enable_all()
@@ -86,10 +102,22 @@ fn one(report: &mut Report, engine: &Engine, setting: &Setting, time: Duration) 
     let clock = Clock::start();
     let bus = SimConfig::first_order(
         BusId::new("plant")?,
-        FopdtSettings { count, tau_s: 0.5, dead_time_s: 0.02, noise: 0.01, ..FopdtSettings::default() },
+        FopdtSettings {
+            count,
+            tau_s: 0.5,
+            dead_time_s: 0.02,
+            noise: 0.01,
+            ..FopdtSettings::default()
+        },
     );
-    let io = IoServer::open(&bumpless_io::Config { buses: vec![BusConfig::Sim(bus)] }, clock, runtime.handle())
-        .map_err(Error::Plant)?;
+    let io = IoServer::open(
+        &bumpless_io::Config {
+            buses: vec![BusConfig::Sim(bus)],
+        },
+        clock,
+        runtime.handle(),
+    )
+    .map_err(Error::Plant)?;
     let here = HostId::new("here")?;
     let seen = Arc::new(Mutex::new(Seen::default()));
     let sink = {
@@ -130,7 +158,13 @@ fn one(report: &mut Report, engine: &Engine, setting: &Setting, time: Duration) 
             instance,
         })?;
         ids.push(spec.id.clone());
-        loops.open_home(HomeRevision { spec: Arc::clone(&spec), wiring }, None)?;
+        loops.open_home(
+            HomeRevision {
+                spec: Arc::clone(&spec),
+                wiring,
+            },
+            None,
+        )?;
         loops.set_members(&spec.id, vec![here.clone()])?;
     }
     // The first cycles touch memory for the first time; they are not the steady state.
@@ -151,10 +185,26 @@ fn one(report: &mut Report, engine: &Engine, setting: &Setting, time: Duration) 
     seen.written_after.tell(report, &format!("{prefix}.frame_to_write"));
     seen.taken_after.tell(report, &format!("{prefix}.deadline_to_write"));
     report.told(&format!("{prefix}.cycles"), taken as f64, "cycles");
-    report.told(&format!("{prefix}.cycles_per_s"), taken as f64 / elapsed.as_secs_f64(), "1/s");
-    report.told(&format!("{prefix}.cycles_lost"), (after.lost - before.lost) as f64, "cycles");
-    report.told(&format!("{prefix}.cycles_skipped"), (after.skipped - before.skipped) as f64, "cycles");
-    report.told(&format!("{prefix}.cpu_per_cycle"), cpu_ns as f64 / 1000.0 / taken.max(1) as f64, "µs");
+    report.told(
+        &format!("{prefix}.cycles_per_s"),
+        taken as f64 / elapsed.as_secs_f64(),
+        "1/s",
+    );
+    report.told(
+        &format!("{prefix}.cycles_lost"),
+        (after.lost - before.lost) as f64,
+        "cycles",
+    );
+    report.told(
+        &format!("{prefix}.cycles_skipped"),
+        (after.skipped - before.skipped) as f64,
+        "cycles",
+    );
+    report.told(
+        &format!("{prefix}.cpu_per_cycle"),
+        cpu_ns as f64 / 1000.0 / taken.max(1) as f64,
+        "µs",
+    );
     Ok(())
 }
 
@@ -174,7 +224,12 @@ fn spec(number: u32, period_ns: u64, digest: bumpless_core::Digest) -> Result<Lo
         replicas: 1,
         limits: BTreeMap::from([(
             "out".to_owned(),
-            OutputLimit { low: 0.0, high: 100.0, rate_per_s: None, safe: 0.0 },
+            OutputLimit {
+                low: 0.0,
+                high: 100.0,
+                rate_per_s: None,
+                safe: 0.0,
+            },
         )]),
         listens: Vec::new(),
         policy: Policy::default(),
@@ -195,7 +250,9 @@ fn counts(loops: &Loops, ids: &[LoopId]) -> bumpless_core::desk::Tally {
 /// Processor time of this process's loop workers so far, in ns. Source: proc(5), `/proc/[pid]/task/[tid]/schedstat`, the
 /// first field.
 fn workers_cpu_ns() -> u64 {
-    let Ok(tasks) = fs::read_dir("/proc/self/task") else { return 0 };
+    let Ok(tasks) = fs::read_dir("/proc/self/task") else {
+        return 0;
+    };
     tasks
         .flatten()
         .map(|task| task.path())

@@ -7,6 +7,7 @@
 mod actuator;
 mod call;
 mod conditions;
+mod delay;
 mod error;
 mod failover;
 mod faults;
@@ -15,9 +16,13 @@ mod law;
 mod local;
 mod peer;
 mod report;
+mod rest;
+mod select;
 mod spread;
 mod stall;
 mod step;
+mod stress;
+mod swap;
 
 use std::process::ExitCode;
 
@@ -41,13 +46,23 @@ enum Bench {
     Failover,
     /// A remote step over loopback TCP between processes, on the bus and through the REST API.
     Call,
+    /// How soon strategies leave a replica that is loaded or far away, and come back.
+    Select,
+    /// 200 swaps on a running loop under load, with and without compiling: lost cycles and the step of the output.
+    Swap,
     /// A step native and in the sandbox, and the cycle of a loop whose owner, replica and I/O are one process.
     Step,
     /// The other process of `call`.
     #[command(hide = true)]
     CallPeer {
-        /// Digest of the component to step.
+        /// The component to step.
         component: std::path::PathBuf,
+    },
+    /// The load of `select`.
+    #[command(hide = true)]
+    Burn {
+        /// The core to load.
+        core: usize,
     },
 }
 
@@ -86,7 +101,10 @@ fn run(bench: &Bench, options: Options) -> Result<bool, Error> {
     let name = match bench {
         Bench::Call => "call",
         Bench::Failover => "failover",
+        Bench::Select => "select",
+        Bench::Swap => "swap",
         Bench::Step => "step",
+        Bench::Burn { core } => return stress::burn(*core).map(|()| true),
         Bench::CallPeer { component } => return peer::run(component).map(|()| true),
     };
     let conditions = Conditions::now(name, options.quick);
@@ -94,8 +112,10 @@ fn run(bench: &Bench, options: Options) -> Result<bool, Error> {
     match bench {
         Bench::Call => call::run(options, &mut report)?,
         Bench::Failover => failover::run(options, &mut report)?,
+        Bench::Select => select::run(options, &mut report)?,
+        Bench::Swap => swap::run(options, &mut report)?,
         Bench::Step => step::run(options, &mut report)?,
-        Bench::CallPeer { .. } => {}
+        Bench::CallPeer { .. } | Bench::Burn { .. } => {}
     }
     Ok(report.end())
 }

@@ -84,7 +84,10 @@ pub(crate) fn run(component: &Path) -> Result<(), Error> {
             source,
         })?;
     let listener = TcpListener::bind("127.0.0.1:0").map_err(Error::io("the echo cannot listen"))?;
-    let echo = listener.local_addr().map_err(Error::io("the echo has no address"))?.to_string();
+    let echo = listener
+        .local_addr()
+        .map_err(Error::io("the echo has no address"))?
+        .to_string();
     std::thread::Builder::new()
         .name("echo".to_owned())
         .spawn(move || listener.incoming().flatten().for_each(answer))

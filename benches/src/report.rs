@@ -210,7 +210,12 @@ mod tests {
         assert_eq!(number(0.0).to_string(), "0");
         assert_eq!(number(1.25).to_string(), "1.25");
         assert_eq!(number(f64::NAN).to_string(), "null");
-        for (value, text) in [(3.0, "3"), (0.00012, "0.000120"), (12.345, "12.35"), (48_012.6, "48013")] {
+        for (value, text) in [
+            (3.0, "3"),
+            (0.00012, "0.000120"),
+            (12.345, "12.35"),
+            (48_012.6, "48013"),
+        ] {
             assert_eq!(short(value), text);
         }
     }

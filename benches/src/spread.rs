@@ -21,7 +21,10 @@ impl Spread {
     /// Nothing measured yet.
     pub(crate) fn new() -> Self {
         let histogram = Histogram::new_with_bounds(1, LONGEST_NS, 3);
-        #[allow(clippy::expect_used, reason = "constants, checked by a test: 2 · low <= high, 0 to 5 digits")]
+        #[allow(
+            clippy::expect_used,
+            reason = "constants, checked by a test: 2 · low <= high, 0 to 5 digits"
+        )]
         Self(histogram.expect("bounds that make sense"))
     }
 
@@ -80,7 +83,10 @@ mod tests {
         spread.add(u64::MAX);
         assert_eq!(spread.count(), 1001);
         assert!((spread.us(0.5) - 501.0).abs() < 1.0);
-        assert!((spread.max_us() - 1e8).abs() < 1e5, "longer than the longest counts as the longest");
+        assert!(
+            (spread.max_us() - 1e8).abs() < 1e5,
+            "longer than the longest counts as the longest"
+        );
         assert_eq!(median(&[3.0, 1.0, 2.0]), 2.0);
         assert!(median(&[]).is_nan());
     }

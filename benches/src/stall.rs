@@ -141,7 +141,11 @@ impl Stalls {
                 _ => united.push(stall),
             }
         }
-        Self { united, count, lateness }
+        Self {
+            united,
+            count,
+            lateness,
+        }
     }
 
     /// For how much of the time between the two a core was stalled, in ns.
@@ -209,6 +213,9 @@ mod tests {
         let threads = watch.threads.len();
         assert!(threads > 0);
         let stalls = watch.finish();
-        assert!(stalls.lateness.count() >= threads as u64, "each thread woke at least once");
+        assert!(
+            stalls.lateness.count() >= threads as u64,
+            "each thread woke at least once"
+        );
     }
 }

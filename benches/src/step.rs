@@ -53,7 +53,12 @@ impl Sandboxed {
 
     fn round(&mut self, steps: u64) -> Result<(), Error> {
         let started = Instant::now();
-        for frame in self.frames.iter().cycle().take(usize::try_from(steps).unwrap_or(usize::MAX)) {
+        for frame in self
+            .frames
+            .iter()
+            .cycle()
+            .take(usize::try_from(steps).unwrap_or(usize::MAX))
+        {
             self.state = self.instance.step(black_box(frame), &self.state, LIMIT_NS)?.state;
         }
         self.rounds_ns.push(started.elapsed().as_nanos() as f64 / steps as f64);
@@ -62,7 +67,12 @@ impl Sandboxed {
 
     /// Each step by itself; the clock's own time is part of it.
     fn one_by_one(&mut self, steps: u64) -> Result<(), Error> {
-        for frame in self.frames.iter().cycle().take(usize::try_from(steps).unwrap_or(usize::MAX)) {
+        for frame in self
+            .frames
+            .iter()
+            .cycle()
+            .take(usize::try_from(steps).unwrap_or(usize::MAX))
+        {
             let started = Instant::now();
             self.state = self.instance.step(black_box(frame), &self.state, LIMIT_NS)?.state;
             self.spread
@@ -77,7 +87,11 @@ fn native_round(memory: &mut Memory, samples: &[Sample], steps: u64) -> f64 {
     let law: Law = black_box(Memory::step);
     let tuning = law::tuning();
     let started = Instant::now();
-    for sample in samples.iter().cycle().take(usize::try_from(steps).unwrap_or(usize::MAX)) {
+    for sample in samples
+        .iter()
+        .cycle()
+        .take(usize::try_from(steps).unwrap_or(usize::MAX))
+    {
         black_box(law(memory, &tuning, black_box(sample)));
     }
     started.elapsed().as_nanos() as f64 / steps as f64
@@ -127,7 +141,11 @@ pub(crate) fn run(options: Options, report: &mut Report) -> Result<(), Error> {
     for component in &sandboxed {
         let each = median(&component.rounds_ns);
         report.told(&format!("step.component.{}", component.name), each, "ns");
-        report.told(&format!("step.component.{}.times_native_pid", component.name), each / native, "×");
+        report.told(
+            &format!("step.component.{}.times_native_pid", component.name),
+            each / native,
+            "×",
+        );
         for (part, text) in [(0.99, "p99"), (0.999, "p99_9")] {
             report.told(
                 &format!("step.component.{}.{text}", component.name),
