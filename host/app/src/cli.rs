@@ -331,7 +331,7 @@ pub fn run(cli: Cli) -> Result<(), Error> {
         Command::Call(args) => commands::components::call(&client()?, json, args),
         Command::Hosts => commands::hosts::list(&client()?, json),
         Command::Points => commands::hosts::points(&client()?, json),
-        Command::Watch(args) => watch::run(client()?, json, &args),
+        Command::Watch(args) => watch::run(&client()?, json, &args),
         Command::Completions { shell } => {
             clap_complete::generate(shell, &mut Cli::command(), "bumpless", &mut std::io::stdout());
             Ok(())

@@ -23,7 +23,7 @@ use crate::{
 use story::Story;
 
 /// Follows a loop until the reader has seen enough.
-pub(crate) fn run(client: Client, json: bool, args: &WatchArgs) -> Result<(), Error> {
+pub(crate) fn run(client: &Client, json: bool, args: &WatchArgs) -> Result<(), Error> {
     // Asked first, so that a wrong name is an error and not a silence.
     let found: Loop = client.get(&format!("/v1/loops/{}", encoded(&args.name)))?.decode()?;
     let story = Story::new(&found);

@@ -1,16 +1,16 @@
 //! The live feed of a cell, from whichever host answers.
 //!
 //! ```text
-//! connecting to host i ── ok ──► reading ── end, silence ──► connecting to the next host known
+//! connecting to host i ── ok ──► reading ── end, silence ──► connecting to the next host known, at once
 //!      └── no ──► (RETRY pause) ──► connecting to the next host known
 //! ```
 //! The queue is bounded; while it is full the thread waits, the host's feed overflows, and the host says how many records
-//! were lost. Never: ends by itself; it ends when its reader is gone.
+//! were lost. Ends when its reader is gone, or when no host answered for GIVE_UP.
 
 use std::{
     io::{BufRead as _, BufReader, Read},
     sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel},
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use bumpless_api::types::{Hosts, Record};
@@ -27,6 +27,8 @@ const QUEUE_MAX: usize = 1_000;
 const SILENCE_MAX: Duration = Duration::from_secs(3);
 /// Pause before the next host is tried, so that a cell that is down is not hammered.
 const RETRY: Duration = Duration::from_millis(250);
+/// Time after which a cell that never answers is given up: long enough for every host of it to be started again.
+const GIVE_UP: Duration = Duration::from_secs(60);
 /// Bytes of one line of the feed: a record with 64 ports has some 20 KB.
 const LINE_BYTES_MAX: u64 = 1024 * 1024;
 
@@ -43,6 +45,8 @@ pub(crate) enum News {
     Connected(String),
     /// The feed ended; another host is tried.
     Disconnected(String),
+    /// No host of the cell answered for [`GIVE_UP`]: the last news.
+    Gone(String),
 }
 
 /// A thread that reads the feed.
@@ -52,12 +56,13 @@ pub(crate) struct Feed {
 
 impl Feed {
     /// Starts reading what concerns one loop.
-    pub(crate) fn start(client: Client, name: &str) -> Result<Self, Error> {
+    pub(crate) fn start(client: &Client, name: &str) -> Result<Self, Error> {
+        let first = client.api().to_owned();
         let (sender, news) = sync_channel(QUEUE_MAX);
         let path = format!("/v1/live?loops={}", encoded(name));
         std::thread::Builder::new()
             .name("feed".to_owned())
-            .spawn(move || follow(client, &path, &sender))
+            .spawn(move || follow(first, &path, &sender))
             .map_err(|error| Error::start("the thread of the feed", error))?;
         Ok(Self { news })
     }
@@ -67,41 +72,49 @@ impl Feed {
         match self.news.recv_timeout(wait) {
             Ok(news) => Some(news),
             Err(RecvTimeoutError::Timeout) => None,
-            // The thread ends only after its reader; if it ever ended before, time would still pass.
-            Err(RecvTimeoutError::Disconnected) => {
-                std::thread::sleep(wait);
-                None
-            }
+            // The thread ended with its last news, which was taken; what it said is still so.
+            Err(RecvTimeoutError::Disconnected) => Some(News::Gone("the feed ended".to_owned())),
         }
     }
 }
 
 /// Reads until nobody listens any more.
-fn follow(first: Client, path: &str, news: &SyncSender<News>) {
-    let mut apis = vec![first.api().to_owned()];
+fn follow(first: String, path: &str, news: &SyncSender<News>) {
+    let mut apis = vec![first];
     let mut turn = 0;
+    let mut answered_at = Instant::now();
     loop {
         let api = apis[turn % apis.len()].clone();
-        let end = match Client::new(&api).and_then(|client| client.stream(path, SILENCE_MAX)) {
+        let (end, had_answered) = match Client::new(&api).and_then(|client| client.stream(path, SILENCE_MAX)) {
             Ok(stream) => {
                 if news.send(News::Connected(api.clone())).is_err() {
                     return;
                 }
-                read(stream, news, &mut apis)
+                let end = read(stream, news, &mut apis);
+                answered_at = Instant::now();
+                (end, true)
             }
-            Err(error) => End::Feed(error.to_string()),
+            Err(error) => (End::Feed(error.to_string()), false),
         };
         match end {
             End::Reader => return,
             End::Feed(reason) => {
-                if news.send(News::Disconnected(format!("{api}: {reason}"))).is_err() {
+                let gone = answered_at.elapsed() >= GIVE_UP;
+                let word = if gone {
+                    News::Gone(reason)
+                } else {
+                    News::Disconnected(reason)
+                };
+                if news.send(word).is_err() || gone {
                     return;
                 }
             }
         }
-        // The one that just failed goes last.
+        // The next one known; at once where the last one answered until now.
         turn = apis.iter().position(|known| *known == api).map_or(turn, |at| at + 1);
-        std::thread::sleep(RETRY);
+        if !had_answered || apis.len() == 1 {
+            std::thread::sleep(RETRY);
+        }
     }
 }
 

@@ -21,45 +21,42 @@ pub(super) fn run(feed: &Feed, mut story: Story, json: bool, cycles: Option<u64>
     }
     let enough = |story: &Story| cycles.is_some_and(|cycles| story.cycles >= cycles);
     while !stop.load(Ordering::Relaxed) && !enough(&story) {
-        match feed.next(LOOK_EVERY) {
-            Some(News::Record(record, text)) => {
-                let before = story.happenings.back().cloned();
-                let line = row(&record);
+        let Some(news) = feed.next(LOOK_EVERY) else { continue };
+        let told = story.happened_count;
+        let mut line = None;
+        match news {
+            News::Record(record, text) => {
+                line = Some(if json { text } else { row(&record) });
                 story.record(*record);
-                if json {
-                    show::line(&text)?;
-                    continue;
-                }
-                let new = story
-                    .happenings
-                    .iter()
-                    .rev()
-                    .take_while(|text| Some(*text) != before.as_ref());
-                let new: Vec<&String> = new.collect();
-                for text in new.into_iter().rev() {
-                    show::line(&format!("  * {}", text.trim_start()))?;
-                }
-                show::line(&line)?;
             }
-            Some(News::Hosts(hosts)) => story.hosts(hosts),
-            Some(News::Lost(records)) => {
+            News::Hosts(hosts) => story.hosts(hosts),
+            News::Lost(records) => {
                 story.lost(records);
                 show::note(&format!("{records} records were lost: this reader is too slow"));
             }
-            Some(News::Connected(api)) => story.feed(format!("from {api}")),
-            Some(News::Disconnected(reason)) => {
-                show::note(&format!("the feed ended ({reason}); trying the next host"));
-                story.feed(reason);
+            News::Connected(api) => story.connected(api),
+            News::Disconnected(reason) => story.disconnected(&reason),
+            News::Gone(reason) => return Err(story.gone(reason)),
+        }
+        if !json {
+            let new = usize::try_from(story.happened_count - told)
+                .unwrap_or(usize::MAX)
+                .min(story.happenings.len());
+            for text in story.happenings.iter().skip(story.happenings.len() - new) {
+                show::line(&format!("  * {}", text.trim_start()))?;
             }
-            None => {}
+        }
+        if let Some(line) = line {
+            show::line(&line)?;
         }
     }
     if !json {
         show::line(&format!(
-            "{}: {} cycles, {} missing, {} takeovers; {}",
+            "{}: {} cycles, {} missing, {} not seen, {} takeovers; {}",
             story.name,
             story.cycles,
             story.missing,
+            story.dropped,
             story.takeovers,
             story.indices_line()
         ))?;

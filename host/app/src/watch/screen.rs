@@ -47,6 +47,7 @@ pub(super) fn run(feed: &Feed, mut story: Story, cycles: Option<u64>) -> Result<
             let next = Instant::now() + FRAME;
             while let Some(left) = next.checked_duration_since(Instant::now()) {
                 match feed.next(left.min(Duration::from_millis(20))) {
+                    Some(News::Gone(reason)) => return Err(story.gone(reason)),
                     Some(news) => take(&mut story, news),
                     None if keys(&mut story).map_err(failed)? => return Ok(()),
                     None => {}
@@ -66,8 +67,8 @@ fn take(story: &mut Story, news: News) {
         News::Record(record, _) => story.record(*record),
         News::Hosts(hosts) => story.hosts(hosts),
         News::Lost(records) => story.lost(records),
-        News::Connected(api) => story.feed(format!("from {api}")),
-        News::Disconnected(reason) => story.feed(format!("the feed ended ({reason})")),
+        News::Connected(api) => story.connected(api),
+        News::Disconnected(reason) | News::Gone(reason) => story.disconnected(&reason),
     }
 }
 
@@ -153,7 +154,7 @@ fn heading(story: &Story) -> Vec<Line<'_>> {
             story.missing,
             story.takeovers,
             if story.dropped > 0 {
-                format!("  (feed dropped {})", story.dropped)
+                format!("  not seen {}", story.dropped)
             } else {
                 String::new()
             }
@@ -286,9 +287,13 @@ mod tests {
     fn a_picture_shows_the_loop_its_hosts_and_what_happened() {
         let mut story = story();
         for seq in 1..30 {
-            story.record(record(seq, ["a", "b", "c"][seq as usize % 3], serde_json::json!([])));
+            story.record(record(seq, ["a", "b", "c"][seq as usize % 3], &serde_json::json!([])));
         }
-        story.record(record(30, "b", serde_json::json!([{"kind": "took-over", "from": "a"}])));
+        story.record(record(
+            30,
+            "b",
+            &serde_json::json!([{"kind": "took-over", "from": "a"}]),
+        ));
         let text = picture(&story, 120, 40);
         for part in [
             "pressure",
@@ -308,7 +313,7 @@ mod tests {
         picture(&story(), 120, 40);
         picture(&story(), 3, 2);
         let mut story = story();
-        story.record(record(1, "a", serde_json::json!([])));
+        story.record(record(1, "a", &serde_json::json!([])));
         picture(&story, 20, 5);
         assert_eq!(bounds([f64::NAN].into_iter()), [0.0, 1.0]);
         assert!(bounds([2.0].into_iter())[0] < 2.0);

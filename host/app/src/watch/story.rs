@@ -7,7 +7,7 @@ use std::collections::{BTreeMap, VecDeque};
 use bumpless_api::types::{Event, Host, Hosts, Loop, Mode, Record};
 use bumpless_core::indices::{Indices, Rule, TotalVariation};
 
-use crate::show;
+use crate::{error::Error, show};
 
 /// Samples that are drawn: more than a terminal has columns, with two dots in each.
 const SAMPLES_MAX: usize = 600;
@@ -41,19 +41,27 @@ pub(super) struct Story {
     pub(super) steppers: VecDeque<String>,
     /// Steps by host, since the watch began.
     pub(super) steps: BTreeMap<String, u64>,
+    /// The last of what happened, in words.
     pub(super) happenings: VecDeque<String>,
+    /// How much happened since the watch began.
+    pub(super) happened_count: u64,
     pub(super) hosts: Vec<Host>,
     pub(super) last: Option<Record>,
     /// Records seen.
     pub(super) cycles: u64,
     /// Cycles of the loop without a record, by their numbers: truly lost, if the feed lost none.
     pub(super) missing: u64,
-    /// Records that the feed dropped because this watcher was too slow.
+    /// Records that this watcher did not get: it was too slow, or its feed was away.
     pub(super) dropped: u64,
     pub(super) takeovers: u64,
-    pub(super) feed: String,
+    /// Where the feed comes from.
+    pub(super) api: String,
     pub(super) indices: Indices,
     pub(super) travel: TotalVariation,
+    /// Has the feed been away since the last record?
+    away: bool,
+    /// Records that the feed says it dropped since the last record.
+    lost_now: u64,
     digest: String,
     start_us: Option<u64>,
 }
@@ -73,15 +81,18 @@ impl Story {
             steppers: VecDeque::new(),
             steps: BTreeMap::new(),
             happenings: VecDeque::new(),
+            happened_count: 0,
             hosts: Vec::new(),
             last: None,
             cycles: 0,
             missing: 0,
             dropped: 0,
             takeovers: 0,
-            feed: String::new(),
+            api: String::new(),
             indices: Indices::new(Rule::Rectangle),
             travel: TotalVariation::default(),
+            away: false,
+            lost_now: 0,
             digest: found.digest.clone(),
             start_us: None,
         }
@@ -107,12 +118,13 @@ impl Story {
                 return;
             }
             let missing = record.seq.saturating_sub(seq).saturating_sub(1);
-            if missing > 0 {
+            if self.away && missing > 0 {
+                self.dropped += missing;
+                self.happened(t_s, &format!("{missing} cycles went by while the feed was away"));
+            } else if missing > self.lost_now {
+                let missing = missing - self.lost_now;
                 self.missing += missing;
-                self.happened(
-                    t_s,
-                    &format!("{missing} cycles before {} have no record here", record.seq),
-                );
+                self.happened(t_s, &format!("{missing} cycles before {} have no record", record.seq));
             }
             if record.mode != mode {
                 self.happened(t_s, &format!("mode is {}", record.mode.name()));
@@ -124,6 +136,7 @@ impl Story {
                 );
             }
         }
+        (self.away, self.lost_now) = (false, 0);
         for event in &record.events {
             if let Event::TookOver { from: Some(_) } = event {
                 self.takeovers += 1;
@@ -175,19 +188,44 @@ impl Story {
         self.hosts = hosts.hosts;
     }
 
-    /// The feed comes from here now, or from nowhere.
-    pub(super) fn feed(&mut self, text: String) {
+    /// The feed comes from this API now.
+    pub(super) fn connected(&mut self, api: String) {
+        if self.away {
+            self.now(&format!("the feed comes from {api}"));
+        }
+        self.api = api;
+    }
+
+    /// The feed ended; another host is tried.
+    pub(super) fn disconnected(&mut self, reason: &str) {
+        // Said once per outage, not once per try.
+        if !self.away {
+            self.now(&format!("the feed of {} ended: {reason}", self.api));
+        }
+        self.away = true;
+    }
+
+    /// No host answers any more.
+    pub(super) fn gone(&self, reason: String) -> Error {
+        Error::Unreachable {
+            api: self.api.clone(),
+            reason: format!("nor any other host of the cell; {reason}"),
+        }
+    }
+
+    fn now(&mut self, text: &str) {
         let t_s = self.samples.back().map_or(0.0, |s| s.t_s);
-        self.happened(t_s, &text);
-        self.feed = text;
+        self.happened(t_s, text);
     }
 
     /// The feed lost records.
     pub(super) fn lost(&mut self, records: u64) {
         self.dropped += records;
+        self.lost_now += records;
     }
 
     fn happened(&mut self, t_s: f64, text: &str) {
+        self.happened_count += 1;
         push(&mut self.happenings, format!("{t_s:8.1} s  {text}"), HAPPENINGS_MAX);
     }
 
@@ -258,7 +296,7 @@ pub(super) mod tests {
         Story::new(&serde_json::from_value(text).expect("a loop"))
     }
 
-    pub(crate) fn record(seq: u64, stepped_by: &str, events: serde_json::Value) -> Record {
+    pub(crate) fn record(seq: u64, stepped_by: &str, events: &serde_json::Value) -> Record {
         let text = serde_json::json!({
             "loop": "pressure", "term": 1, "seq": seq, "revision": 1, "digest": "aa", "owner": "a",
             "stepped_by": stepped_by, "at_unix_us": 1_000_000 + seq * 100_000, "dt_ms": 100.0, "mode": "automatic",
@@ -273,10 +311,10 @@ pub(super) mod tests {
     fn a_story_counts_what_matters() {
         let mut story = story();
         for (seq, host) in [(1, "a"), (2, "b"), (3, "c"), (3, "c")] {
-            story.record(record(seq, host, serde_json::json!([])));
+            story.record(record(seq, host, &serde_json::json!([])));
         }
         let took_over = serde_json::json!([{"kind": "took-over", "from": "a"}]);
-        story.record(record(6, "b", took_over));
+        story.record(record(6, "b", &took_over));
         assert_eq!((story.cycles, story.missing, story.takeovers), (4, 2, 1));
         assert_eq!(
             story.steps,
@@ -293,10 +331,40 @@ pub(super) mod tests {
     }
 
     #[test]
+    fn a_feed_that_was_away_is_no_loss_of_the_loop() {
+        let nothing = serde_json::json!([]);
+        let mut story = story();
+        story.connected("http://a".to_owned());
+        story.record(record(1, "a", &nothing));
+        story.disconnected("it ended");
+        story.disconnected("connection refused");
+        story.connected("http://b".to_owned());
+        story.record(record(5, "a", &nothing));
+        assert_eq!((story.missing, story.dropped), (0, 3));
+        // What the feed itself lost is none either; what is beyond it is.
+        story.lost(2);
+        story.record(record(8, "a", &nothing));
+        assert_eq!((story.missing, story.dropped), (0, 5));
+        story.record(record(10, "a", &nothing));
+        assert_eq!((story.missing, story.dropped), (1, 5));
+        let said: Vec<&str> = story
+            .happenings
+            .iter()
+            .map(|text| text.split_once("  ").expect("a time").1.trim())
+            .collect();
+        assert!(said[0].ends_with("the feed of http://a ended: it ended"), "{said:?}");
+        assert!(said[1].ends_with("the feed comes from http://b"), "{said:?}");
+        assert!(
+            said[2].ends_with("3 cycles went by while the feed was away"),
+            "{said:?}"
+        );
+    }
+
+    #[test]
     fn what_is_kept_is_bounded() {
         let mut story = story();
         for seq in 1..2_000 {
-            story.record(record(seq, "a", serde_json::json!([{"kind": "policy-held"}])));
+            story.record(record(seq, "a", &serde_json::json!([{"kind": "policy-held"}])));
         }
         assert_eq!((story.samples.len(), story.steppers.len()), (SAMPLES_MAX, STEPPERS_MAX));
         assert_eq!(story.happenings.len(), HAPPENINGS_MAX);
