@@ -1,1 +1,84 @@
 //! End-to-end tests: cells of real processes, asked as users ask them.
+//!
+//! | file | what it tells |
+//! |---|---|
+//! | story | a loop's whole life: swaps, commands, the death of its owner |
+//! | restarts | the whole cell, or the I/O host alone, dies and comes back |
+//! | members | frozen owners, late hosts, draining |
+//! | calls | the cell as a control service |
+//! | refusals | bad components, loops, requests, configurations, command lines |
+//! | modbus | a real Modbus device that dies and comes back |
+//! | neighbours | two cells on one machine |
+//! | watching | metrics, the document of the API, the live feed |
+//! | guides | the commands in the documentation |
+//! | house | the rules of the source itself |
+
+mod calls;
+mod guides;
+mod house;
+mod members;
+mod modbus;
+mod neighbours;
+mod refusals;
+mod restarts;
+mod story;
+mod watching;
+
+use bumpless_tests::{Api, Journal};
+use serde_json::Value;
+
+/// No write of a second writer, and nothing lost from the log itself.
+#[track_caller]
+fn one_writer(journal: &Journal) {
+    let violations: Vec<String> = journal.check_one_writer().iter().map(ToString::to_string).collect();
+    assert!(
+        violations.is_empty(),
+        "{} violations: {violations:#?}",
+        violations.len()
+    );
+    assert_eq!(journal.dropped, 0, "lines of the journal were dropped");
+}
+
+/// A number that must be there.
+#[track_caller]
+fn number(value: &Value) -> f64 {
+    value.as_f64().unwrap_or_else(|| panic!("{value} is no number"))
+}
+
+/// A whole number that must be there.
+#[track_caller]
+fn whole(value: &Value) -> u64 {
+    value.as_u64().unwrap_or_else(|| panic!("{value} is no whole number"))
+}
+
+/// A text that must be there.
+#[track_caller]
+fn text(value: &Value) -> String {
+    value
+        .as_str()
+        .unwrap_or_else(|| panic!("{value} is no text"))
+        .to_owned()
+}
+
+/// Names in a list.
+fn names(list: &Value) -> Vec<String> {
+    list.as_array()
+        .map(|rows| rows.iter().filter_map(Value::as_str).map(str::to_owned).collect())
+        .unwrap_or_default()
+}
+
+/// Waits until the loop's measurement has stayed within `band` of the setpoint for some cycles.
+#[track_caller]
+fn settle(api: &Api, name: &str, band: f64) -> Value {
+    let feed = api.live(&format!("?loops={name}")).unwrap();
+    let good = std::cell::Cell::new(0);
+    feed.record_where(&format!("{name} within {band} of its setpoint"), |record| {
+        let near = matches!(
+            (record["measurement"].as_f64(), record["setpoint"].as_f64()),
+            (Some(pv), Some(sp)) if (pv - sp).abs() <= band
+        );
+        good.set(if near { good.get() + 1 } else { 0 });
+        good.get() >= 10
+    })
+    .unwrap()
+}

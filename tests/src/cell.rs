@@ -5,7 +5,7 @@ use std::{path::Path, time::Duration};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-use crate::{Api, Error, HostOptions, HostProcess, Journal, wait_until};
+use crate::{Api, Error, HostOptions, HostProcess, Journal, slots::Slot, wait_until};
 
 /// Name of the host with the plant.
 pub const PLANT: &str = "plant";
@@ -78,8 +78,10 @@ pub struct Cell {
     /// The cell's name.
     pub name: String,
     options: CellOptions,
-    // Last, so that it is removed when nobody writes into it any more.
+    // After the hosts, so that it is removed when nobody writes into it any more.
     folder: TempDir,
+    // Last of all: the next cell starts when this one is gone.
+    _slot: Slot,
 }
 
 impl Cell {
@@ -88,6 +90,7 @@ impl Cell {
     /// # Errors
     /// Where a host does not start, or they do not find each other in 30 s.
     pub fn start(options: CellOptions) -> Result<Self, Error> {
+        let slot = Slot::take()?;
         let folder = tempfile::Builder::new()
             .prefix("bumpless-")
             .tempdir()
@@ -112,6 +115,7 @@ impl Cell {
             name,
             options,
             folder,
+            _slot: slot,
         };
         for n in 0..cell.options.controllers {
             let host = cell.spawn_controller(&controller_name(n))?;
@@ -272,8 +276,23 @@ pub fn pressure_loop(component: &str, period_ms: f64) -> Value {
         "component": component,
         "period_ms": period_ms,
         "ports": { "pv": "plant.pit129", "out": "plant.p1" },
-        "parameters": { "k": 3.0, "ti": 3.0, "out-low": 0.0, "out-high": 10.0 },
+        "parameters": { "k": 4.0, "ti": 4.0, "out-low": 0.0, "out-high": 10.0 },
         "setpoint": 0.5,
+        "strategy": "round-robin",
+    })
+}
+
+/// Loop `n` of a bus of first-order loops, named `loop-n`, as a loop to apply. Nearly all integral action: whatever the
+/// measurement does, the output moves slowly, so a jump of the output is a fault of the hosts and not of the tuning.
+#[must_use]
+pub fn first_order_loop(n: usize, component: &str, period_ms: f64) -> Value {
+    json!({
+        "name": format!("loop-{n}"),
+        "component": component,
+        "period_ms": period_ms,
+        "ports": { "pv": format!("plant.{n}.pv"), "out": format!("plant.{n}.out") },
+        "parameters": { "k": 0.1, "ti": 0.2 },
+        "setpoint": 40.0,
         "strategy": "round-robin",
     })
 }

@@ -16,13 +16,14 @@ mod error;
 mod feed;
 mod host;
 mod journal;
+mod slots;
 mod wait;
 
 use std::path::PathBuf;
 
 pub use api::{Answer, Api};
 pub use binary::Binary;
-pub use cell::{Cell, CellOptions, PLANT, pressure_loop};
+pub use cell::{Cell, CellOptions, PLANT, first_order_loop, pressure_loop};
 pub use error::Error;
 pub use feed::{Event, Feed};
 pub use host::{HostOptions, HostProcess};
