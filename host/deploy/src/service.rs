@@ -321,11 +321,11 @@ mod tests {
         type Change = fn(&mut Call);
         let table: [(Change, &str); 5] = [
             (
-                |c| drop(c.inputs.insert("x".into(), 1.0)),
+                |c| c.inputs.extend([("x".into(), 1.0)]),
                 "pid has no input \"x\"; it has pv, aux",
             ),
-            (|c| drop(c.inputs.insert("out".into(), 1.0)), "pid has no input \"out\""),
-            (|c| drop(c.track.insert("out".into(), f64::NAN)), "output \"out\" = NaN"),
+            (|c| c.inputs.extend([("out".into(), 1.0)]), "pid has no input \"out\""),
+            (|c| c.track.extend([("out".into(), f64::NAN)]), "output \"out\" = NaN"),
             (|c| c.setpoint = f64::INFINITY, "setpoint = inf"),
             (
                 |c| {

@@ -184,10 +184,10 @@ async fn a_rollback_in_probation_becomes_the_intent() {
 #[tokio::test(flavor = "multi_thread")]
 async fn two_changes_at_once_come_one_after_the_other() {
     let (_cell, io) = running().await;
-    let (loop_id, two) = (id("l"), io.deploy.clone());
+    let loop_id = id("l");
     let (a, b) = tokio::join!(
         io.deploy.set(&loop_id, set("k", 3.0)),
-        two.set(&loop_id, set("ti", 30.0))
+        io.deploy.set(&loop_id, set("ti", 30.0))
     );
     let mut numbers = [a.unwrap().revision, b.unwrap().revision];
     numbers.sort_unstable();

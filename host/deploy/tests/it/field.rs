@@ -2,7 +2,7 @@
 
 use std::{
     collections::{BTreeMap, BTreeSet, HashMap},
-    sync::{Arc, OnceLock},
+    sync::Arc,
 };
 
 use bumpless_cell::Vitals;
@@ -54,7 +54,7 @@ pub(crate) struct FakeField {
     here: HostId,
     engine: Engine,
     state: Mutex<State>,
-    pub(crate) deploy: OnceLock<Deploy>,
+    pub(crate) deploy: Arc<Mutex<Option<Deploy>>>,
 }
 
 impl FakeField {
@@ -63,7 +63,7 @@ impl FakeField {
             here,
             engine,
             state: Mutex::default(),
-            deploy: OnceLock::new(),
+            deploy: Arc::default(),
         }
     }
 
@@ -105,7 +105,7 @@ impl FakeField {
             home.last = Some(Arc::clone(&record));
             (record, revised)
         };
-        let deploy = self.deploy.get().expect("a started host");
+        let deploy = self.deploy.lock().clone().expect("a started host");
         if revised {
             deploy.arrive(DeployArrival::Loops(LoopsEvent::Revised {
                 loop_id: record.loop_id.clone(),

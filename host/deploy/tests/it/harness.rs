@@ -16,6 +16,7 @@ use bumpless_deploy::{Deploy, DeployArrival, LoopDraft, Parts};
 use bumpless_engine::Engine;
 use bumpless_io::{Clock, IoServer};
 use bumpless_store::{RecordWriter, Store};
+use parking_lot::Mutex;
 use tempfile::TempDir;
 
 use crate::field::FakeField;
@@ -53,6 +54,7 @@ pub(crate) struct Host {
     pub(crate) store: Store,
     pub(crate) dir: PathBuf,
     writer: Arc<RecordWriter>,
+    sink: Arc<Mutex<Option<Deploy>>>,
 }
 
 /// A cell, with the disks of its hosts.
@@ -105,12 +107,13 @@ impl Cell {
         let dir = self.disks.path().join(name);
         let store = Store::open(&dir).expect("a store");
         let writer = Arc::new(RecordWriter::start(store.clone()).unwrap());
-        let deploy: Arc<OnceLock<Deploy>> = Arc::default();
+        let deploy: Arc<Mutex<Option<Deploy>>> = Arc::default();
         let sink = Arc::clone(&deploy);
         let session = Session::open(
             &config,
             Arc::new(move |arrival| {
-                if let Some(deploy) = sink.get() {
+                let deploy = sink.lock().clone();
+                if let Some(deploy) = deploy {
                     deploy.arrive(DeployArrival::Bus(arrival));
                 }
             }),
@@ -148,8 +151,8 @@ impl Cell {
             version: "test".to_owned(),
         })
         .expect("deployment starts");
-        field.deploy.set(started.clone()).unwrap();
-        deploy.set(started.clone()).unwrap();
+        *field.deploy.lock() = Some(started.clone());
+        *deploy.lock() = Some(started.clone());
         Host {
             deploy: started,
             field,
@@ -157,6 +160,7 @@ impl Cell {
             store,
             dir,
             writer,
+            sink: deploy,
         }
     }
 }
@@ -183,8 +187,12 @@ impl Host {
             store,
             dir: _,
             writer,
+            sink,
         } = self;
         deploy.shutdown().await;
+        // Loops and bus know deployment, which knows them.
+        *sink.lock() = None;
+        *field.deploy.lock() = None;
         session.close().await;
         drop((deploy, field, store));
         // The tasks that were stopped let go of the rest when they are next polled.
