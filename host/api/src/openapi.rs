@@ -63,6 +63,23 @@ mod tests {
     }
 
     #[test]
+    fn every_operation_has_a_name_of_its_own() {
+        let document: serde_json::Value = serde_json::from_str(&openapi_json()).expect("it is JSON");
+        let paths = document["paths"].as_object().expect("paths");
+        let ids: Vec<&str> = paths
+            .values()
+            .flat_map(|path| path.as_object().expect("operations").values())
+            .map(|operation| operation["operationId"].as_str().expect("an id"))
+            .collect();
+        let different: std::collections::HashSet<&&str> = ids.iter().collect();
+        assert_eq!(
+            different.len(),
+            ids.len(),
+            "generated clients name their functions after these: {ids:?}"
+        );
+    }
+
+    #[test]
     fn every_route_is_in_the_document() {
         let document: serde_json::Value = serde_json::from_str(&openapi_json()).expect("it is JSON");
         let listed = document["paths"].as_object().expect("paths").len();

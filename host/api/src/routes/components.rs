@@ -36,7 +36,7 @@ fn seen(app: &App, info: ComponentInfo) -> Component {
 }
 
 /// Lists the library.
-#[utoipa::path(get, path = "/v1/components", tag = "components",
+#[utoipa::path(get, operation_id = "list_components", path = "/v1/components", tag = "components",
     responses((status = 200, description = "The library, by name and version", body = Components)))]
 pub(crate) async fn list(State(app): State<App>) -> JsonAnswer<Components> {
     JsonAnswer(Components {
@@ -57,7 +57,7 @@ pub(crate) struct UploadQuery {
 
 /// Uploads a component: the raw bytes of a `.wasm` component, at most 32 MiB. It is inspected and compiled outside of this
 /// process before it is taken in.
-#[utoipa::path(post, path = "/v1/components", tag = "components", params(UploadQuery),
+#[utoipa::path(post, operation_id = "upload_component", path = "/v1/components", tag = "components", params(UploadQuery),
     request_body(content = Vec<u8>, content_type = "application/wasm", description = "The component"),
     responses(
         (status = 201, description = "Taken in, or known already", body = Component),
@@ -101,7 +101,7 @@ pub(crate) async fn upload(
 }
 
 /// Shows one component. `reference` is `name` (the newest version), `name@version`, or a digest or its first 8 digits.
-#[utoipa::path(get, path = "/v1/components/{reference}", tag = "components", params(("reference" = String, Path)),
+#[utoipa::path(get, operation_id = "show_component", path = "/v1/components/{reference}", tag = "components", params(("reference" = String, Path)),
     responses(
         (status = 200, description = "The component", body = Component),
         (status = "default", description = "What went wrong", body = Problem, content_type = "application/problem+json")))]
@@ -114,7 +114,7 @@ pub(crate) async fn show(
 }
 
 /// Downloads a component's bytes.
-#[utoipa::path(get, path = "/v1/components/{reference}/bytes", tag = "components", params(("reference" = String, Path)),
+#[utoipa::path(get, operation_id = "download_component", path = "/v1/components/{reference}/bytes", tag = "components", params(("reference" = String, Path)),
     responses(
         (status = 200, description = "The component's bytes", body = Vec<u8>, content_type = "application/wasm"),
         (status = "default", description = "What went wrong", body = Problem, content_type = "application/problem+json")))]
@@ -134,7 +134,7 @@ pub(crate) async fn bytes(State(app): State<App>, InPath(reference): InPath<Stri
 }
 
 /// Removes a component from the library of the cell. Refused while a loop uses it.
-#[utoipa::path(delete, path = "/v1/components/{reference}", tag = "components", params(("reference" = String, Path)),
+#[utoipa::path(delete, operation_id = "remove_component", path = "/v1/components/{reference}", tag = "components", params(("reference" = String, Path)),
     responses(
         (status = 204, description = "Removed"),
         (status = 409, description = "A loop uses it", body = Problem, content_type = "application/problem+json"),
@@ -145,7 +145,7 @@ pub(crate) async fn remove(State(app): State<App>, InPath(reference): InPath<Str
 }
 
 /// Runs one step of a component on a host of the cell: the cell as a control service. The state goes back and forth.
-#[utoipa::path(post, path = "/v1/components/{reference}/call", tag = "components", params(("reference" = String, Path)),
+#[utoipa::path(post, operation_id = "call_component", path = "/v1/components/{reference}/call", tag = "components", params(("reference" = String, Path)),
     request_body = CallRequest,
     responses(
         (status = 200, description = "The step's outputs and state", body = CallAnswer),

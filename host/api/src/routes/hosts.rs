@@ -9,7 +9,7 @@ use crate::{
 };
 
 /// Lists the hosts of the cell.
-#[utoipa::path(get, path = "/v1/hosts", tag = "cell",
+#[utoipa::path(get, operation_id = "list_hosts", path = "/v1/hosts", tag = "cell",
     responses((status = 200, description = "The hosts, by name", body = Hosts)))]
 pub(crate) async fn list(State(app): State<App>) -> JsonAnswer<Hosts> {
     JsonAnswer(Hosts {
@@ -18,7 +18,7 @@ pub(crate) async fn list(State(app): State<App>) -> JsonAnswer<Hosts> {
 }
 
 /// Lists the points of all hosts with their values.
-#[utoipa::path(get, path = "/v1/points", tag = "cell",
+#[utoipa::path(get, operation_id = "list_points", path = "/v1/points", tag = "cell",
     responses(
         (status = 200, description = "The points, by name", body = Points),
         (status = "default", description = "What went wrong", body = Problem, content_type = "application/problem+json")))]

@@ -53,7 +53,7 @@ pub(crate) struct LiveQuery {
 
 /// Follows the records. Events: `record` (a record), `hosts` (the hosts, every second, the first at once), `lost` (how many
 /// records this reader was too slow for).
-#[utoipa::path(get, path = "/v1/live", tag = "cell", params(LiveQuery),
+#[utoipa::path(get, operation_id = "follow_records", path = "/v1/live", tag = "cell", params(LiveQuery),
     responses(
         (status = 200, description = "Server-sent events: `record` with a Record, `hosts` with Hosts, `lost` with {\"records\": n}",
             body = Record, content_type = "text/event-stream"),

@@ -42,7 +42,7 @@ pub(crate) struct ListQuery {
 }
 
 /// Lists the loops, by name.
-#[utoipa::path(get, path = "/v1/loops", tag = "loops", params(ListQuery),
+#[utoipa::path(get, operation_id = "list_loops", path = "/v1/loops", tag = "loops", params(ListQuery),
     responses(
         (status = 200, description = "The loops", body = Loops),
         (status = "default", description = "What went wrong", body = Problem, content_type = "application/problem+json")))]
@@ -83,7 +83,7 @@ pub(crate) struct ShowQuery {
 }
 
 /// Shows one loop with its last record.
-#[utoipa::path(get, path = "/v1/loops/{name}", tag = "loops", params(("name" = String, Path), ShowQuery),
+#[utoipa::path(get, operation_id = "show_loop", path = "/v1/loops/{name}", tag = "loops", params(("name" = String, Path), ShowQuery),
     responses(
         (status = 200, description = "The loop", body = Loop),
         (status = "default", description = "What went wrong", body = Problem, content_type = "application/problem+json")))]
@@ -101,7 +101,7 @@ pub(crate) async fn show(
 }
 
 /// Creates or changes a loop. Answers when the change is in force on the actuator's side, or refused with nothing changed.
-#[utoipa::path(put, path = "/v1/loops/{name}", tag = "loops", params(("name" = String, Path)), request_body = LoopDraft,
+#[utoipa::path(put, operation_id = "apply_loop", path = "/v1/loops/{name}", tag = "loops", params(("name" = String, Path)), request_body = LoopDraft,
     responses(
         (status = 200, description = "In force", body = Apply),
         (status = 201, description = "Created", body = Apply),
@@ -132,7 +132,7 @@ pub(crate) async fn apply(
 }
 
 /// Ends a loop. Its outputs stay as they are.
-#[utoipa::path(delete, path = "/v1/loops/{name}", tag = "loops", params(("name" = String, Path)),
+#[utoipa::path(delete, operation_id = "remove_loop", path = "/v1/loops/{name}", tag = "loops", params(("name" = String, Path)),
     responses(
         (status = 204, description = "Ended"),
         (status = "default", description = "What went wrong", body = Problem, content_type = "application/problem+json")))]
@@ -156,7 +156,7 @@ async fn command(
 }
 
 /// Sets the setpoint.
-#[utoipa::path(post, path = "/v1/loops/{name}/setpoint", tag = "commands", request_body = SetpointRequest,
+#[utoipa::path(post, operation_id = "set_setpoint", path = "/v1/loops/{name}/setpoint", tag = "commands", request_body = SetpointRequest,
     params(("name" = String, Path), ("Idempotency-Key" = Option<String>, Header, description = "UUID; asking twice with it acts once")),
     responses(
         (status = 200, description = "Part of a committed record", body = Command),
@@ -172,7 +172,7 @@ pub(crate) async fn setpoint(
 }
 
 /// Puts the loop in manual or automatic, without a bump.
-#[utoipa::path(post, path = "/v1/loops/{name}/mode", tag = "commands", request_body = ModeRequest,
+#[utoipa::path(post, operation_id = "set_mode", path = "/v1/loops/{name}/mode", tag = "commands", request_body = ModeRequest,
     params(("name" = String, Path), ("Idempotency-Key" = Option<String>, Header, description = "UUID; asking twice with it acts once")),
     responses(
         (status = 200, description = "Part of a committed record", body = Command),
@@ -188,7 +188,7 @@ pub(crate) async fn mode(
 }
 
 /// Sets outputs in manual; an output that is not named keeps what it holds.
-#[utoipa::path(post, path = "/v1/loops/{name}/output", tag = "commands", request_body = OutputRequest,
+#[utoipa::path(post, operation_id = "set_output", path = "/v1/loops/{name}/output", tag = "commands", request_body = OutputRequest,
     params(("name" = String, Path), ("Idempotency-Key" = Option<String>, Header, description = "UUID; asking twice with it acts once")),
     responses(
         (status = 200, description = "Part of a committed record", body = Command),
@@ -248,7 +248,7 @@ fn output_values(ports: &[&str], held: &[f64], asked: &BTreeMap<String, f64>) ->
 }
 
 /// Sets parameters or the strategy of a running loop.
-#[utoipa::path(post, path = "/v1/loops/{name}/set", tag = "loops", params(("name" = String, Path)), request_body = SetRequest,
+#[utoipa::path(post, operation_id = "set_parameters", path = "/v1/loops/{name}/set", tag = "loops", params(("name" = String, Path)), request_body = SetRequest,
     responses(
         (status = 200, description = "In force", body = Apply),
         (status = "default", description = "What went wrong; nothing changed", body = Problem, content_type = "application/problem+json")))]
@@ -267,7 +267,7 @@ pub(crate) async fn set(
 }
 
 /// Goes on with another component, without a bump.
-#[utoipa::path(post, path = "/v1/loops/{name}/swap", tag = "loops", params(("name" = String, Path)), request_body = SwapRequest,
+#[utoipa::path(post, operation_id = "swap_component", path = "/v1/loops/{name}/swap", tag = "loops", params(("name" = String, Path)), request_body = SwapRequest,
     responses(
         (status = 200, description = "In force", body = Apply),
         (status = 409, description = "Refused, for example because the output would bump", body = Problem, content_type = "application/problem+json"),
@@ -285,7 +285,7 @@ pub(crate) async fn swap(
 }
 
 /// Goes back to an earlier revision.
-#[utoipa::path(post, path = "/v1/loops/{name}/rollback", tag = "loops", params(("name" = String, Path)), request_body = RollbackRequest,
+#[utoipa::path(post, operation_id = "roll_back_loop", path = "/v1/loops/{name}/rollback", tag = "loops", params(("name" = String, Path)), request_body = RollbackRequest,
     responses(
         (status = 200, description = "In force", body = Apply),
         (status = "default", description = "What went wrong; nothing changed", body = Problem, content_type = "application/problem+json")))]
@@ -302,7 +302,7 @@ pub(crate) async fn rollback(
 }
 
 /// Gives the ownership to another host, between two cycles.
-#[utoipa::path(post, path = "/v1/loops/{name}/move", tag = "loops", params(("name" = String, Path)), request_body = MoveRequest,
+#[utoipa::path(post, operation_id = "move_loop", path = "/v1/loops/{name}/move", tag = "loops", params(("name" = String, Path)), request_body = MoveRequest,
     responses(
         (status = 204, description = "The next cycle is that host's"),
         (status = "default", description = "What went wrong; nothing changed", body = Problem, content_type = "application/problem+json")))]

@@ -16,14 +16,14 @@ use crate::{
 };
 
 /// Is the process alive?
-#[utoipa::path(get, path = "/healthz", tag = "operation",
+#[utoipa::path(get, operation_id = "is_alive", path = "/healthz", tag = "operation",
     responses((status = 200, description = "It is", body = Value)))]
 pub(crate) async fn healthz(State(app): State<App>) -> JsonAnswer<Value> {
     JsonAnswer(json!({ "host": app.cell.here().as_str(), "alive": true }))
 }
 
 /// May work be sent to this host? Not while it starts or is being emptied.
-#[utoipa::path(get, path = "/readyz", tag = "operation",
+#[utoipa::path(get, operation_id = "is_ready", path = "/readyz", tag = "operation",
     responses(
         (status = 200, description = "It may", body = Value),
         (status = 503, description = "Not now; says why", body = Problem, content_type = "application/problem+json")))]
@@ -45,7 +45,7 @@ pub(crate) async fn readyz(State(app): State<App>) -> Result<JsonAnswer<Value>, 
 }
 
 /// Metrics for Prometheus.
-#[utoipa::path(get, path = "/metrics", tag = "operation",
+#[utoipa::path(get, operation_id = "read_metrics", path = "/metrics", tag = "operation",
     responses((status = 200, description = "OpenMetrics text", body = String, content_type = "application/openmetrics-text")))]
 pub(crate) async fn metrics(State(app): State<App>) -> Result<impl IntoResponse, Problem> {
     let text = app
@@ -56,7 +56,7 @@ pub(crate) async fn metrics(State(app): State<App>) -> Result<impl IntoResponse,
 }
 
 /// This document.
-#[utoipa::path(get, path = "/openapi.json", tag = "operation",
+#[utoipa::path(get, operation_id = "read_openapi", path = "/openapi.json", tag = "operation",
     responses((status = 200, description = "OpenAPI 3.1", body = Value)))]
 pub(crate) async fn openapi() -> impl IntoResponse {
     ([(header::CONTENT_TYPE, "application/json")], openapi_json())

@@ -56,8 +56,8 @@ impl From<HostView> for Host {
             control: view.control,
             draining: view.draining,
             api: view.api,
-            cpu_percent: finite(f64::from(view.cpu) * 100.0).unwrap_or_default(),
-            cpu_process_cores: finite(f64::from(view.cpu_process)).unwrap_or_default(),
+            cpu_percent: rounded(f64::from(view.cpu) * 100.0),
+            cpu_process_cores: rounded(f64::from(view.cpu_process)),
             memory_bytes: view.memory_bytes,
             latency_ms: view.latency_ns.map(ms),
             loops_owned: view.loops_owned,
@@ -65,6 +65,11 @@ impl From<HostView> for Host {
             version: view.version,
         }
     }
+}
+
+/// Three decimals: a sampled load has no more.
+fn rounded(value: f64) -> f64 {
+    finite((value * 1e3).round() / 1e3).unwrap_or_default()
 }
 
 /// The points of all hosts, by name.
