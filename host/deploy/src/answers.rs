@@ -7,6 +7,7 @@ use std::{pin::Pin, sync::Arc};
 use bumpless_core::HostId;
 
 use crate::{
+    bench::stopping,
     book::on_disk,
     error::Error,
     limits::RECORDS_ASKED,
@@ -40,6 +41,7 @@ impl Room {
                 }
                 Ask::Points(first) => Ok(self.points_here(first)),
                 Ask::Bytes(digest) => {
+                    let _place = self.sending.acquire().await.map_err(|_| stopping())?;
                     let store = self.store.clone();
                     let missing = || Error::not_found(format!("host {} does not have it", self.here), "");
                     on_disk(move || store.component(&digest))

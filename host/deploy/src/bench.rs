@@ -13,7 +13,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use bumpless_core::{Descriptor, Digest, HostId, LoopSpec, Wiring};
+use bumpless_core::{ComponentInfo, Descriptor, Digest, HostId, LoopSpec, Wiring};
 use bumpless_engine::{Engine, Instance, Prepared};
 use bumpless_loops::HeldRevision;
 use parking_lot::Mutex;
@@ -22,8 +22,9 @@ use tokio::sync::Semaphore;
 use crate::{
     book::on_disk,
     error::{Error, Words, chain},
-    limits::{FETCH_WAIT, PREPARED_AHEAD_MAX, RECONCILE_EVERY, WARM_LIMIT_NS},
-    room::{Room, count},
+    holder::wanted_revisions,
+    limits::{FETCH_WAIT, PREPARED_AHEAD_MAX, PREPARED_KEPT_MAX, RECONCILE_EVERY, WARM_LIMIT_NS},
+    room::{Room, count, every},
     roster::back_off,
     wire::{Ask, Told},
 };
@@ -182,12 +183,12 @@ impl Room {
     /// Compiles the newest components of the library before anyone needs them, one at a time.
     pub(crate) async fn prepare_ahead(room: Arc<Self>) {
         let mut failed: HashMap<Digest, (u32, Instant)> = HashMap::new();
-        let mut tick = tokio::time::interval(RECONCILE_EVERY);
-        tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+        let mut tick = every(RECONCILE_EVERY);
         loop {
             tick.tick().await;
             let mut infos = room.library.all();
             infos.sort_by_key(|info| std::cmp::Reverse(info.uploaded_at_unix_ms));
+            room.forget_unneeded(&infos);
             let now = Instant::now();
             let next = infos.iter().take(PREPARED_AHEAD_MAX).find(|info| {
                 !room.bench.is_ready(&info.digest) && failed.get(&info.digest).is_none_or(|(_, again)| *again <= now)
@@ -202,6 +203,33 @@ impl Room {
             }
             failed.retain(|digest, _| infos.iter().any(|info| info.digest == *digest));
             tick.reset_after(Duration::from_millis(1));
+        }
+    }
+
+    /// Makes room in the engine: what no loop uses and is not among the newest, oldest first.
+    fn forget_unneeded(&self, newest_first: &[Arc<ComponentInfo>]) {
+        let ready = self.bench.ready();
+        let Some(extra) = ready.len().checked_sub(PREPARED_KEPT_MAX).filter(|extra| *extra > 0) else {
+            return;
+        };
+        let mut needed: BTreeSet<Digest> = newest_first
+            .iter()
+            .take(PREPARED_AHEAD_MAX)
+            .map(|info| info.digest)
+            .collect();
+        for intent in self.book.all() {
+            needed.extend(wanted_revisions(&intent).into_iter().map(|spec| spec.digest));
+        }
+        let age = |digest: &Digest| {
+            newest_first
+                .iter()
+                .position(|info| info.digest == *digest)
+                .unwrap_or(usize::MAX)
+        };
+        let mut unneeded: Vec<Digest> = ready.into_iter().filter(|digest| !needed.contains(digest)).collect();
+        unneeded.sort_by_key(|digest| std::cmp::Reverse(age(digest)));
+        for digest in unneeded.iter().take(extra) {
+            self.bench.forget(digest);
         }
     }
 }

@@ -242,13 +242,14 @@ impl Book {
         writers
     }
 
-    /// Loops that name this component in any revision: in force, on its way, or kept to go back to.
+    /// Loops that run this component, are about to, or go back to it in a probation or when they are told "back". Revisions
+    /// before that may need the component to be uploaded again.
     pub(crate) fn users_of(&self, digest: &bumpless_core::Digest) -> Vec<LoopId> {
         let pages = self.pages.read();
         let uses = |intent: &Intent| {
-            // Only what could be asked for without a new upload: the revision that "back" leads to, not all history.
             intent.current.digest == *digest
                 || intent.pending.as_ref().is_some_and(|s| s.digest == *digest)
+                || intent.past.first().is_some_and(|s| s.digest == *digest)
                 || intent.previous().is_some_and(|s| s.digest == *digest)
         };
         pages

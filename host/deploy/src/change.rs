@@ -83,6 +83,7 @@ impl Room {
             match room.book.get(&id) {
                 None => room.create(&draft, &info).await,
                 Some(intent) => {
+                    room.is_home(&intent)?;
                     let spec = plan::spec(
                         &draft,
                         info.digest,
@@ -105,6 +106,7 @@ impl Room {
     ) -> Result<ApplyEnd, Error> {
         self.in_turn(id.clone(), move |room| async move {
             let intent = room.book.find(&id)?;
+            room.is_home(&intent)?;
             let current = &intent.current;
             let (spec, dropped) = match amend {
                 Amend::Swap(reference) => {
@@ -152,6 +154,19 @@ impl Room {
             room.change(Arc::clone(&intent), spec, &info, dropped).await
         })
         .await
+    }
+
+    fn is_home(&self, intent: &Intent) -> Result<(), Error> {
+        if intent.home == self.here {
+            return Ok(());
+        }
+        Err(Error::refused(
+            format!(
+                "loop {} has its home at host {}, not at {}",
+                intent.loop_id, intent.home, self.here
+            ),
+            "ask again; a loop's home cannot change, except by deleting the loop and creating it anew",
+        ))
     }
 
     /// One change of a loop at a time, a few at a home, each in a task of its own.
@@ -293,22 +308,13 @@ impl Room {
         dropped: Dropped,
     ) -> Result<ApplyEnd, Error> {
         let id = intent.loop_id.clone();
-        if intent.home != self.here {
-            let home = &intent.home;
-            return Err(Error::refused(
-                format!("loop {id} has its home at host {home}, not at {}", self.here),
-                "a loop's home cannot change; delete the loop and create it anew",
-            ));
-        }
         if !self.homes.is_open(&id) {
             return Err(Error::busy(
                 format!("loop {id} is not open at its home yet"),
                 "try again; its failures say what is in the way",
             ));
         }
-        if let Some(revision) = self.unsettled(&id) {
-            self.settle_locked(&id, revision).await?;
-        }
+        self.settle_locked(&id).await?;
         let current = &self.book.find(&id)?.current.clone();
         let end = |revision, unchanged, hand_over| ApplyEnd {
             id: id.clone(),
@@ -479,12 +485,13 @@ impl Room {
             .cloned()
             .ok_or_else(|| Error::internal("the intent has no such revision"))?;
         let home = intent.home.clone();
-        if home != *from || spec.id != intent.loop_id {
+        if home != *from {
             return Err(Error::refused(
                 format!("only the home of loop {} may ask for this", intent.loop_id),
                 "",
             ));
         }
+        crate::sync::check(&intent)?;
         if home != self.here {
             self.book.keep(Arc::new(intent)).await?;
         }

@@ -131,7 +131,7 @@ impl Deploy {
     /// # Errors
     /// [`Error::Invalid`], [`Error::NotFound`] for a component or point, [`Error::Refused`] by a host or by the running
     /// loop (for example because of the bump), [`Error::Busy`], [`Error::Unreachable`]. Then nothing has changed.
-    /// [`Error::Timeout`] after 60 s without an answer: look at the loop.
+    /// [`Error::Timeout`] after 28 s without an answer: look at the loop.
     pub async fn apply(&self, mut draft: LoopDraft) -> Result<ApplyEnd, Error> {
         let id = plan::loop_id(&draft.name)?;
         // By digest, for the home may not have heard of the component yet.

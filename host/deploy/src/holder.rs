@@ -124,18 +124,12 @@ impl Holder {
     }
 }
 
-/// Revisions that a member keeps ready: in force, on its way, and the one that probation or "back" leads to.
+/// Revisions that a member keeps ready: in force, on its way, and the one left last, where a probation leads back to.
 pub(crate) fn wanted_revisions(intent: &Intent) -> Vec<&LoopSpec> {
     std::iter::once(&intent.current)
         .chain(&intent.pending)
         .chain(intent.past.first())
-        .chain(intent.previous())
-        .fold(Vec::new(), |mut wanted, spec| {
-            if !wanted.iter().any(|w: &&LoopSpec| w.revision == spec.revision) {
-                wanted.push(spec);
-            }
-            wanted
-        })
+        .collect()
 }
 
 /// The hosts that shall hold a loop.
@@ -222,17 +216,15 @@ impl Room {
         if entry.revisions.iter().all(|r| wanted.contains(r)) {
             return;
         }
-        entry.revisions.retain(|r| wanted.contains(r));
-        let keep = entry.revisions.iter().copied().collect();
-        drop(held);
-        if let Err(error) = self.field.keep_revisions(id, keep) {
-            tracing::debug!(loop_id = %id, %error, "old revisions stay for now");
+        let keep = entry.revisions.iter().copied().filter(|r| wanted.contains(r)).collect();
+        match self.field.keep_revisions(id, keep) {
+            Ok(()) => entry.revisions.retain(|r| wanted.contains(r)),
+            Err(error) => tracing::debug!(loop_id = %id, %error, "old revisions stay for now"),
         }
     }
 
     fn release_unwanted(&self, eligible: &[HostId]) {
         let now = Instant::now();
-        let mut released = Vec::new();
         self.holder.held.lock().retain(|id, entry| {
             let intent = self.book.get(id);
             if intent
@@ -243,17 +235,12 @@ impl Room {
                 return true;
             }
             let since = *entry.unwanted_since.get_or_insert(now);
-            let keep = intent.is_some() && now.saturating_duration_since(since) < RELEASE_AFTER;
-            if !keep {
-                released.push(id.clone());
+            if intent.is_some() && now.saturating_duration_since(since) < RELEASE_AFTER {
+                return true;
             }
-            keep
+            // Too busy: the next look asks again.
+            self.field.release(id).is_err()
         });
-        for id in released {
-            if let Err(error) = self.field.release(&id) {
-                tracing::debug!(loop_id = %id, %error, "a loop was not released");
-            }
-        }
         self.holder
             .failures
             .lock()

@@ -17,6 +17,7 @@ use std::{
 
 use bumpless_core::{ComponentInfo, Digest, HostId, Intent, LoopId, LoopSpec, PointId, Record, place};
 use bumpless_loops::HomeRevision;
+use futures_util::future::join_all;
 use parking_lot::Mutex;
 use tokio::task::JoinSet;
 
@@ -133,6 +134,17 @@ pub(crate) fn members_now(
     chosen
 }
 
+/// Takes back what is on its way in, where nobody waits for it.
+fn withdraw_pending(intent: &mut Intent) -> Result<(), Error> {
+    match intent.pending.as_ref().map(|spec| spec.revision) {
+        Some(pending) => intent
+            .withdraw(pending)
+            .map(drop)
+            .map_err(|error| Error::internal(error.to_string())),
+        None => Ok(()),
+    }
+}
+
 impl Room {
     /// What this host knows of one of its points.
     pub(crate) fn point_facts(&self, point: &PointId, of: &LoopId) -> Option<PointFacts> {
@@ -226,36 +238,47 @@ impl Room {
         }
     }
 
-    /// Opens homes, settles revisions, tells members. Idempotent.
+    /// Settles revisions, tells members, opens homes. Idempotent.
     pub(crate) async fn keep_homes(self: &Arc<Self>) {
-        let ours: Vec<Arc<Intent>> = self.book.all().into_iter().filter(|i| i.home == self.here).collect();
-        for intent in &ours {
+        let ours = || self.book.all().into_iter().filter(|intent| intent.home == self.here);
+        // The open ones first: opening may have to wait for other hosts.
+        let eligible = self.roster.eligible();
+        let mut look_again = false;
+        for intent in ours().filter(|intent| self.homes.is_open(&intent.loop_id)) {
+            if let Err(error) = self.settle(&intent).await {
+                tracing::warn!(loop_id = %intent.loop_id, %error, "the revision in force could not be kept; it is tried again");
+            }
+            look_again |= self.tell_members(&intent, &eligible);
+        }
+        if look_again {
+            self.poke_in(MOVE_LOOK);
+        }
+        for intent in ours().filter(|intent| !self.homes.is_open(&intent.loop_id)) {
             let (id, revision) = (&intent.loop_id, intent.current.revision);
             if self.stopped() {
                 return;
             }
-            if self.homes.is_open(id) {
-                if let Err(error) = self.settle(id).await {
-                    self.holder.failed(id, revision, &error);
-                }
-            } else if self.holder.due(id, revision)
-                && let Ok(_turn) = self.homes.locks.of(id).try_lock()
+            let lock = self.homes.locks.of(id);
+            // A new loop is opened by the change that creates it.
+            if self.holder.due(id, revision)
+                && let Ok(_turn) = lock.try_lock()
+                && !self.homes.is_open(id)
                 && let Err(error) = self.reopen(id).await
             {
                 self.holder.failed(id, revision, &error);
             }
         }
-        let eligible = self.roster.eligible();
-        for intent in self.book.all().iter().filter(|i| i.home == self.here) {
-            self.tell_members(intent, &eligible);
-        }
     }
 
     /// Opens the home of a loop that was there before. The caller has the loop's lock.
     async fn reopen(self: &Arc<Self>, id: &LoopId) -> Result<(), Error> {
+        let Some(held) = self.book.get(id) else { return Ok(()) };
+        if self.feed.last(id).is_none() {
+            // The disk knows of no record, for example because it is new; a member may.
+            self.ask_for_record(id).await;
+        }
         let last = self.feed.last(id).map(|last| last.record);
-        let mut intent = (*self.book.find(id)?).clone();
-        let before = intent.position();
+        let mut intent = (*held).clone();
         if let Some(record) = &last
             && intent.find(record.revision).is_some()
         {
@@ -263,18 +286,25 @@ impl Room {
                 .commit(record.revision)
                 .map_err(|error| Error::internal(error.to_string()))?;
         }
-        // Whoever waited for it is gone with the process that asked the loop.
-        if let Some(pending) = intent.pending.as_ref().map(|spec| spec.revision) {
-            intent
-                .withdraw(pending)
-                .map_err(|error| Error::internal(error.to_string()))?;
-        }
-        let intent = if intent.position() == before {
-            Arc::new(intent)
+        withdraw_pending(&mut intent)?;
+        let intent = if intent.position() == held.position() {
+            held
         } else {
             self.publish(intent).await?
         };
         self.open(&intent, last).await
+    }
+
+    async fn ask_for_record(self: &Arc<Self>, id: &LoopId) {
+        let hosts = self.roster.others();
+        let ask = |host: HostId| async move { self.ask(&host, Ask::Records(vec![id.clone()]), GATHER_WAIT).await };
+        for answer in join_all(hosts.into_iter().map(ask)).await {
+            if let Ok(Told::Records(records)) = answer {
+                for record in records.into_iter().filter(|record| record.loop_id == *id) {
+                    self.feed.remember(&Arc::new(record));
+                }
+            }
+        }
     }
 
     /// Hands a home to the loops.
@@ -301,7 +331,9 @@ impl Room {
             .lock()
             .insert(intent.loop_id.clone(), Opened::default());
         self.holder.succeeded(&intent.loop_id, intent.current.revision);
-        self.tell_members(intent, &self.roster.eligible());
+        if self.tell_members(intent, &self.roster.eligible()) {
+            self.poke_in(MOVE_LOOK);
+        }
         Ok(())
     }
 
@@ -312,27 +344,38 @@ impl Room {
         Ok(intent)
     }
 
-    /// The arbiter took a record of another revision than the intent has in force, outside of a change: a probation went
-    /// back. A change that is under way settles for itself.
-    async fn settle(&self, id: &LoopId) -> Result<(), Error> {
-        let Some(revision) = self.homes.revised.lock().get(id).copied() else {
+    /// Outside of a change: the arbiter took a record of another revision than the intent has in force, because a probation
+    /// went back; or a change ended without being able to clear up, because the disk was full. A change that is under way
+    /// settles for itself.
+    async fn settle(&self, intent: &Intent) -> Result<(), Error> {
+        let id = &intent.loop_id;
+        if self.unsettled(id).is_none() && intent.pending.is_none() {
             return Ok(());
-        };
+        }
         let lock = self.homes.locks.of(id);
         let Ok(_turn) = lock.try_lock() else { return Ok(()) };
-        self.settle_locked(id, revision).await
+        self.settle_locked(id).await
     }
 
     /// As [`Room::settle`], for a caller that has the loop's lock.
-    pub(crate) async fn settle_locked(&self, id: &LoopId, revision: u64) -> Result<(), Error> {
-        let mut intent = (*self.book.find(id)?).clone();
-        if intent.current.revision != revision && intent.commit(revision).is_ok_and(|changed| changed) {
-            tracing::info!(loop_id = %id, revision, "the loop went on with another revision by itself");
+    pub(crate) async fn settle_locked(&self, id: &LoopId) -> Result<(), Error> {
+        let held = self.book.find(id)?;
+        let mut intent = (*held).clone();
+        let revised = self.unsettled(id);
+        match revised.map(|revision| intent.commit(revision)) {
+            Some(Ok(true)) => {
+                tracing::info!(loop_id = %id, revision = intent.current.revision, "the loop went on with another revision by itself");
+            }
+            Some(Err(error)) => tracing::error!(loop_id = %id, %error, "the loop runs a revision that nobody knows"),
+            Some(Ok(false)) | None => {}
+        }
+        withdraw_pending(&mut intent)?;
+        if intent.position() != held.position() {
             self.publish(intent).await?;
         }
-        let mut revised = self.homes.revised.lock();
-        if revised.get(id) == Some(&revision) {
-            revised.remove(id);
+        let mut unsettled = self.homes.revised.lock();
+        if unsettled.get(id).copied() == revised {
+            unsettled.remove(id);
         }
         Ok(())
     }
@@ -342,19 +385,20 @@ impl Room {
         self.homes.revised.lock().get(id).copied()
     }
 
-    /// Tells the loops who may own this one, if that changed. An owner that shall not stay moves the loop first.
-    fn tell_members(self: &Arc<Self>, intent: &Intent, eligible: &[HostId]) {
+    /// Tells the loops who may own this one, if that changed. An owner that shall not stay moves the loop first; then this
+    /// says that it must be looked at again.
+    fn tell_members(&self, intent: &Intent, eligible: &[HostId]) -> bool {
         let id = &intent.loop_id;
-        let Some(mut opened) = self.homes.opened.lock().get(id).cloned() else {
-            return;
-        };
+        // Held to the end, so that of two tellers at once the later one is also the one that is remembered.
+        let mut all = self.homes.opened.lock();
+        let Some(opened) = all.get_mut(id) else { return false };
         let n = usize::from(intent.current.replicas);
         let wanted: Vec<HostId> = wanted_members(intent, eligible).into_iter().take(n).collect();
         let ranked = place::rank(id, eligible);
         let ready = |host: &HostId| self.homes.is_ready(host, id, intent.current.revision);
         let mut members = members_now(&wanted, &ranked, n, &ready);
         if members == opened.members && opened.leaving.is_none() {
-            return;
+            return false;
         }
         let owner = self.field.home_view(id).and_then(|view| view.owner);
         match owner {
@@ -370,7 +414,6 @@ impl Room {
                     }
                     members.push(owner.clone());
                     opened.leaving = Some((owner, since));
-                    self.poke_in(MOVE_LOOK);
                 } else {
                     opened.leaving = None;
                 }
@@ -383,9 +426,7 @@ impl Room {
                 Err(error) => tracing::debug!(loop_id = %id, %error, "the members are told again later"),
             }
         }
-        if let Some(entry) = self.homes.opened.lock().get_mut(id) {
-            *entry = opened;
-        }
+        opened.leaving.is_some()
     }
 }
 

@@ -17,6 +17,13 @@ pub const REMOVALS_REMEMBERED_MAX: usize = 64;
 /// loops that run older ones.
 pub const PREPARED_AHEAD_MAX: usize = 128;
 
+/// Compiled components that are kept without need; beyond it those that no loop uses and that are not among the newest
+/// are forgotten, before the engine's places run out.
+pub const PREPARED_KEPT_MAX: usize = 192;
+
+/// Components that a host sends at once: a new one is asked for by all hosts together, and each takes its size in memory.
+pub const SENDING_MAX: usize = 4;
+
 /// Uploads at once: each holds a component in memory, some of them twice.
 pub const UPLOADS_MAX: usize = 4;
 
@@ -47,8 +54,9 @@ pub const COMMAND_WAIT_MAX: Duration = Duration::from_secs(20);
 /// How much longer the asker of a command waits than the home does, so that the home's words arrive.
 pub const ANSWER_MARGIN: Duration = Duration::from_millis(500);
 
-/// Longest time of a change, as its asker sees it.
-pub const APPLY_WAIT: Duration = Duration::from_secs(60);
+/// How long the asker of a change waits for its end: less than the half minute after which HTTP clients commonly give up, so
+/// that the words arrive. The change itself goes on.
+pub const APPLY_WAIT: Duration = Duration::from_secs(28);
 
 /// How long the members may take to make a revision ready; a compilation that is under way may be ahead of it.
 pub const READY_WAIT: Duration = Duration::from_secs(20);

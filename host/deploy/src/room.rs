@@ -39,7 +39,7 @@ use crate::{
     holder::Holder,
     home::Homes,
     library::Library,
-    limits::{CHANGES_MAX, NOTICES_WAITING_MAX, RECONCILE_EVERY, UPLOADS_MAX, VITALS_EVERY},
+    limits::{CHANGES_MAX, NOTICES_WAITING_MAX, RECONCILE_EVERY, SENDING_MAX, UPLOADS_MAX, VITALS_EVERY},
     roster::Roster,
     view::Counters,
     wire::{self, Ask, Notice, Told},
@@ -141,12 +141,15 @@ pub(crate) struct Room {
     pub(crate) tallies: Tallies,
     pub(crate) uploads: Semaphore,
     pub(crate) changes: Semaphore,
+    /// Components on their way to other hosts.
+    pub(crate) sending: Semaphore,
     /// Held while an upload is let in, so that two of one name do not pass at once.
     pub(crate) admission: tokio::sync::Mutex<()>,
     pub(crate) comparing: Mutex<Comparing>,
     own: Mutex<Vitals>,
     draining: AtomicBool,
-    poke: Notify,
+    poke_homes: Notify,
+    poke_holds: Notify,
     notices: mpsc::Sender<(HostId, Notice)>,
     stop: watch::Sender<bool>,
     runtime: Handle,
@@ -201,11 +204,13 @@ impl Room {
             tallies: Tallies::default(),
             uploads: Semaphore::new(UPLOADS_MAX),
             changes: Semaphore::new(CHANGES_MAX),
+            sending: Semaphore::new(SENDING_MAX),
             admission: tokio::sync::Mutex::default(),
             comparing: Mutex::default(),
             own: Mutex::new(own),
             draining: AtomicBool::new(false),
-            poke: Notify::new(),
+            poke_homes: Notify::new(),
+            poke_holds: Notify::new(),
             notices,
             stop: watch::Sender::new(false),
             runtime,
@@ -224,7 +229,8 @@ impl Room {
             room.roster.up(&host);
         }
         room.spawn(Self::tell_vitals(Arc::clone(&room), probe));
-        room.spawn(Self::reconcile(Arc::clone(&room)));
+        room.spawn(Self::reconcile_homes(Arc::clone(&room)));
+        room.spawn(Self::reconcile_holds(Arc::clone(&room)));
         room.spawn(Self::prepare_ahead(Arc::clone(&room)));
         room.spawn(Self::hear_notices(Arc::clone(&room), arrived));
         Ok(room)
@@ -251,7 +257,8 @@ impl Room {
 
     /// Something changed: compare what runs with what shall run.
     pub(crate) fn poke(&self) {
-        self.poke.notify_one();
+        self.poke_homes.notify_one();
+        self.poke_holds.notify_one();
     }
 
     /// Pokes later.
@@ -389,8 +396,7 @@ impl Room {
     }
 
     async fn tell_vitals(room: Arc<Self>, mut probe: Probe) {
-        let mut tick = tokio::time::interval(VITALS_EVERY);
-        tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+        let mut tick = every(VITALS_EVERY);
         loop {
             tick.tick().await;
             let measured = probe.sample();
@@ -428,10 +434,11 @@ impl Room {
         self.poke();
     }
 
-    async fn reconcile(room: Arc<Self>) {
+    /// Keeps the homes as they shall be. Apart from what is held, for a compilation there must not delay what a home does
+    /// about a host that went.
+    async fn reconcile_homes(room: Arc<Self>) {
         Self::gather_records(&room).await;
-        let mut tick = tokio::time::interval(RECONCILE_EVERY);
-        tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+        let mut tick = every(RECONCILE_EVERY);
         loop {
             tokio::select! {
                 _ = tick.tick() => {
@@ -443,9 +450,20 @@ impl Room {
                     room.announce_standing();
                     room.feed.prune(|id| room.book.get(id).is_some());
                 }
-                () = room.poke.notified() => {}
+                () = room.poke_homes.notified() => {}
             }
             room.keep_homes().await;
+        }
+    }
+
+    /// Keeps what is held as it shall be.
+    async fn reconcile_holds(room: Arc<Self>) {
+        let mut tick = every(RECONCILE_EVERY);
+        loop {
+            tokio::select! {
+                _ = tick.tick() => {}
+                () = room.poke_holds.notified() => {}
+            }
             room.keep_holds().await;
         }
     }
@@ -493,6 +511,13 @@ fn silent(host: &HostId, wait: Duration) -> Error {
         format!("host {host} did not answer within {} s", wait.as_secs_f32()),
         "what was asked may still happen; look before you ask again",
     )
+}
+
+/// A beat that does not catch up what it missed.
+pub(crate) fn every(period: Duration) -> tokio::time::Interval {
+    let mut tick = tokio::time::interval(period);
+    tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+    tick
 }
 
 /// Now, in ms of Unix time; a clock that was never set counts from 0.

@@ -11,7 +11,7 @@
 
 use std::sync::Arc;
 
-use bumpless_core::{Digest, HostId, LoopId};
+use bumpless_core::{Digest, HostId, Intent, LoopId, intent::PAST_REVISIONS_MAX};
 use tokio::sync::{Semaphore, mpsc};
 
 use crate::{
@@ -20,6 +20,19 @@ use crate::{
     room::{Room, count},
     wire::{Ask, Notice, Position, Told},
 };
+
+/// Checks an intent that came from another host, as far as it can be without its components.
+pub(crate) fn check(intent: &Intent) -> Result<(), Error> {
+    let id = &intent.loop_id;
+    let sound = intent.past.len() <= PAST_REVISIONS_MAX && intent.revisions().all(|s| s.id == *id && s.check().is_ok());
+    if sound {
+        Ok(())
+    } else {
+        Err(Error::internal(format!(
+            "what a host sent as the intent of loop {id} is none"
+        )))
+    }
+}
 
 impl Room {
     /// Works on notices until the room stops.
@@ -158,16 +171,18 @@ impl Room {
         let Told::Intent(Some(intent)) = self.ask(from, Ask::Intent(id.clone()), ANSWER_WAIT).await? else {
             return Ok(());
         };
-        if intent.loop_id != id || intent.revisions().any(|spec| spec.id != id || spec.check().is_err()) {
-            count(&self.tallies.malformed);
-            return Err(Error::internal("the answer is no intent of that loop"));
-        }
+        let sound = if intent.loop_id == id {
+            check(&intent)
+        } else {
+            Err(Error::internal("the answer is another intent"))
+        };
+        sound.inspect_err(|_| count(&self.tallies.malformed))?;
         self.take_intent(*intent).await
     }
 
     /// Takes another host's copy of an intent. Of a loop whose home is here there is nothing newer elsewhere, except after
     /// this host lost its disk.
-    async fn take_intent(self: &Arc<Self>, intent: bumpless_core::Intent) -> Result<(), Error> {
+    async fn take_intent(self: &Arc<Self>, intent: Intent) -> Result<(), Error> {
         let position: Position = intent.position();
         if !self.book.wants(&intent.loop_id, position) || self.book.len() >= LOOPS_MAX {
             return Ok(());

@@ -29,7 +29,8 @@ async fn bad_drafts_are_refused_in_words_and_leave_nothing() {
     };
     let narrow = limit(10.0, 20.0, 30.0);
     let wide = limit(-5.0, 100.0, 0.0);
-    let table: Vec<(Box<dyn Fn(&mut LoopDraft)>, Kind, &str)> = vec![
+    type Row = (Box<dyn Fn(&mut LoopDraft)>, Kind, &'static str);
+    let table: Vec<Row> = vec![
         (edit(|d| d.name = "Bad Name".into()), invalid, "lower-case"),
         (edit(|d| d.name = "call".into()), invalid, "cannot be the name"),
         (

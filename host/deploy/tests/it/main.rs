@@ -17,4 +17,5 @@ mod field;
 mod harness;
 mod lifetime;
 mod orders;
+mod real;
 mod uploads;

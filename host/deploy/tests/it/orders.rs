@@ -187,7 +187,7 @@ async fn calls_step_a_component_and_points_say_who_writes_them() {
     let out = points.iter().find(|p| p.id.as_str() == "io.1.out").unwrap();
     assert_eq!(
         (
-            out.written_by.as_ref().map(|l| l.as_str()),
+            out.written_by.as_ref().map(bumpless_core::LoopId::as_str),
             out.writable,
             out.unit.as_str()
         ),
