@@ -5,8 +5,8 @@
 //! its address may operate the cell, so it listens on loopback unless the configuration says otherwise.
 //!
 //! ```text
-//! connection ─► one of REQUESTS_MAX places ─► time limit of the route ─► extract ─► Cell (deploy) ─► types ─► JSON
-//!                       └ full: 503             └ over: 504               └ bad: 4xx   └ error: the map in `error`
+//! connection (CONNECTIONS_MAX) ─► request (REQUESTS_MAX) ─► time limit ─► extract ─► Cell (deploy) ─► types ─► JSON
+//!             └ full: waits                  └ full: 503       └ over: 504  └ bad: 4xx  └ error: the map in `error`
 //! ```
 //! A change that has begun is finished even when its asker leaves.
 //!
@@ -18,6 +18,7 @@ pub mod types;
 mod cell;
 mod error;
 mod extract;
+mod gate;
 mod metrics;
 mod openapi;
 #[allow(

@@ -7,6 +7,13 @@ use std::time::Duration;
 /// Bytes of a JSON body. The largest honest one is a call with 64 KiB of state, which base64 makes a third longer.
 pub const JSON_BYTES_MAX: usize = 256 * 1024;
 
+/// Connections that are open at once: each costs some 20 KiB and a file handle, of which a process often has 1,024.
+pub const CONNECTIONS_MAX: usize = 512;
+
+/// Time without a byte either way after which a connection is closed. A feed writes every second, and a client that keeps a
+/// connection for later may open another.
+pub const IDLE_TIME_MAX: Duration = Duration::from_secs(180);
+
 /// Requests that are worked on at once; more are refused at once with 503, so that a flood cannot pile up memory.
 pub const REQUESTS_MAX: usize = 128;
 

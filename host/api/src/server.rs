@@ -30,6 +30,7 @@ use tokio::{
 use crate::{
     cell::{Answer, Cell},
     error::{Error, Kind, Problem},
+    gate::Gate,
     limits::{
         CALL_TIME_MAX, CHANGE_TIME_MAX, FEEDS_MAX, PORT_TABLES_MAX, REQUEST_TIME_MAX, REQUESTS_MAX, STOP_TIME_MAX,
         UPLOAD_TIME_MAX, UPLOADS_MAX,
@@ -148,7 +149,7 @@ pub(crate) async fn serve_cell(
         let _ = stopping.send(true);
     };
     let serving = async {
-        axum::serve(listener, router(app))
+        axum::serve(Gate::new(listener), router(app))
             .with_graceful_shutdown(graceful)
             .await
     };
