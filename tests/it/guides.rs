@@ -1,1 +1,142 @@
-//! x
+//! The commands in the documentation do what they say: blocks of ```sh marked `<!-- run -->` are run.
+//!
+//! The blocks of one file run in their order in one shell and an empty folder, with `bumpless` on the path and
+//! `$COMPONENTS` naming the folder with the components. Whatever they leave behind is ended.
+
+use std::{
+    fmt::Write as _,
+    fs::{self, File},
+    os::unix::process::CommandExt as _,
+    path::{Path, PathBuf},
+    process::{Command, Stdio},
+    time::Duration,
+};
+
+use bumpless_tests::{Binary, components, repository, wait_until};
+use rustix::process::{Pid, Signal, kill_process_group};
+
+/// Longest time for all blocks of one file.
+const FILE_MAX: Duration = Duration::from_secs(240);
+
+/// A block to run and the line of its first command.
+#[derive(Debug, PartialEq, Eq)]
+struct Block {
+    line: usize,
+    text: String,
+}
+
+/// The marked blocks of a file.
+fn blocks(text: &str) -> Vec<Block> {
+    let mut blocks = Vec::new();
+    let mut lines = text.lines().enumerate();
+    while let Some((_, line)) = lines.next() {
+        if line.trim() != "<!-- run -->" {
+            continue;
+        }
+        let (at, fence) = lines.next().unwrap_or_default();
+        assert_eq!(
+            fence.trim(),
+            "```sh",
+            "line {}: a block of sh must follow the mark",
+            at + 1
+        );
+        let body: Vec<&str> = lines
+            .by_ref()
+            .map(|(_, line)| line)
+            .take_while(|line| line.trim() != "```")
+            .collect();
+        blocks.push(Block {
+            line: at + 2,
+            text: body.join("\n"),
+        });
+    }
+    blocks
+}
+
+/// Runs a file's blocks; gives what they wrote where they fail.
+fn run(name: &str, blocks: &[Block]) -> Result<(), String> {
+    let folder = tempfile::tempdir().map_err(|error| error.to_string())?;
+    let binary = Binary::find().map_err(|error| error.to_string())?;
+    let components = components().map_err(|error| error.to_string())?;
+    let mut script = String::from("set -euo pipefail\n");
+    for block in blocks {
+        let _infallible = write!(script, "echo '--- {name}, line {}'\n{}\n", block.line, block.text);
+    }
+    let log_path = folder.path().join(".log");
+    let log = File::create(&log_path).map_err(|error| error.to_string())?;
+    let errors = log.try_clone().map_err(|error| error.to_string())?;
+    let path = std::env::var("PATH").unwrap_or_default();
+    let beside = binary.path().parent().unwrap_or(Path::new("/"));
+    let mut shell = Command::new("bash")
+        .args(["-c", &script])
+        .current_dir(folder.path())
+        .env("PATH", format!("{}:{path}", beside.display()))
+        .env("COMPONENTS", components)
+        .env_remove("BUMPLESS_API")
+        .stdin(Stdio::null())
+        .stdout(log)
+        .stderr(errors)
+        // A group of its own, so that all of it can be ended.
+        .process_group(0)
+        .spawn()
+        .map_err(|error| format!("bash cannot be run: {error}"))?;
+    let ended = wait_until(name, FILE_MAX, || shell.try_wait().ok().flatten().ok_or("it runs"));
+    if let Some(group) = i32::try_from(shell.id()).ok().and_then(Pid::from_raw) {
+        // An empty group is what a tidy guide leaves.
+        let _empty = kill_process_group(group, Signal::KILL);
+    }
+    let log = fs::read_to_string(&log_path).unwrap_or_default();
+    match ended {
+        Ok(status) if status.success() => Ok(()),
+        Ok(status) => Err(format!("{status}\n{log}")),
+        Err(error) => Err(format!("{error}\n{log}")),
+    }
+}
+
+/// README.md and docs/*.md.
+fn documents() -> Vec<PathBuf> {
+    let root = repository();
+    let mut files: Vec<PathBuf> = fs::read_dir(root.join("docs"))
+        .unwrap()
+        .map(|entry| entry.unwrap().path())
+        .filter(|path| path.extension().is_some_and(|e| e == "md"))
+        .collect();
+    files.push(root.join("README.md"));
+    files.sort();
+    files
+}
+
+#[test]
+fn the_commands_in_the_guides_run() {
+    let mut failures = Vec::new();
+    let mut count = 0;
+    for path in documents() {
+        let text = fs::read_to_string(&path).unwrap();
+        let blocks = blocks(&text);
+        if blocks.is_empty() {
+            continue;
+        }
+        count += blocks.len();
+        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        if let Err(why) = run(&name, &blocks) {
+            failures.push(format!("{name}: {why}"));
+        }
+    }
+    assert!(failures.is_empty(), "{}", failures.join("\n\n"));
+    assert!(count >= 5, "only {count} blocks are marked <!-- run -->");
+}
+
+#[test]
+fn marked_blocks_are_found_and_a_command_that_fails_is_shown() {
+    let text =
+        "x\n```sh\nfalse\n```\n<!-- run -->\n```sh\necho one\nA=5\n```\n\n<!-- run -->\n```sh\ntest \"$A\" = 6\n```\n";
+    let found = blocks(text);
+    assert_eq!(found.iter().map(|b| b.line).collect::<Vec<_>>(), [7, 13]);
+    assert_eq!(found[0].text, "echo one\nA=5");
+    run("good.md", &found[..1]).unwrap();
+    let why = run("bad.md", &found).unwrap_err();
+    assert!(
+        why.contains("exit status: 1") && why.contains("--- bad.md, line 13"),
+        "{why}"
+    );
+}

@@ -18,8 +18,8 @@ fn running_cell(controllers: usize, period_ms: f64) -> Cell {
     let mut draft = first_order_loop(0, "pid", period_ms);
     draft["replicas"] = json!(controllers.min(3));
     api.apply(&draft).unwrap();
-    api.wait_for_loop(LOOP, "all members", |view| {
-        names(&view["members"]).len() == controllers.min(3)
+    api.wait_for_loop(LOOP, "all members and a first cycle", |view| {
+        names(&view["members"]).len() == controllers.min(3) && view["owner"].is_string()
     })
     .unwrap();
     cell
@@ -85,8 +85,16 @@ fn a_late_host_gets_the_component_and_takes_a_place_that_is_left() {
     })
     .unwrap();
     let here = cell.api_of("d").unwrap();
-    let component = here.get(&format!("/v1/components/{digest}")).unwrap();
-    assert!(names(&component["ready_on"]).contains(&"d".to_owned()), "{component}");
+    here.wait_until("the late host to say that it is ready", |api| {
+        let component = api.get(&format!("/v1/components/{digest}")).unwrap();
+        let ready = names(&component["ready_on"]);
+        if ready.contains(&"d".to_owned()) {
+            Ok(())
+        } else {
+            Err(ready)
+        }
+    })
+    .unwrap();
     let bytes = here
         .send("GET", &format!("/v1/components/{digest}/bytes"), &[], &[])
         .unwrap();
