@@ -6,7 +6,10 @@
 //! ```
 //! Never: builds a room (that is `compose`).
 
-use std::{io::Read as _, time::Duration};
+use std::{
+    io::{IsTerminal as _, Read as _},
+    time::Duration,
+};
 
 use serde::{Deserialize, Serialize};
 use tokio::signal::unix::{SignalKind, signal};
@@ -52,7 +55,7 @@ pub(crate) fn run(args: &HostArgs) -> Result<(), Error> {
         };
         let buses = config.buses.buses.len();
         return show::line(&format!(
-            "{}: good: host {} of cell {}, {roles}, {buses} buses, API on {}",
+            "{}: good: host {} of cell {}, {roles}, buses: {buses}, API on {}",
             config.path.display(),
             config.host,
             config.cell.cell,
@@ -79,7 +82,8 @@ fn log(format: LogFormat) {
     let filter = EnvFilter::try_from_env("BUMPLESS_LOG").unwrap_or_else(|_| EnvFilter::new(LOG_DEFAULT));
     let lines = tracing_subscriber::fmt()
         .with_env_filter(filter)
-        .with_writer(std::io::stderr);
+        .with_writer(std::io::stderr)
+        .with_ansi(std::io::stderr().is_terminal());
     // Only one log can be set; whoever set one before (a test) keeps it.
     let _ = match format {
         LogFormat::Text => lines.try_init(),
