@@ -26,7 +26,11 @@ pub struct Config {
     /// `unixsock-stream//run/bumpless/plant.sock` for hosts on one machine (a quarter faster than TCP). At most 64.
     #[serde(default = "listen_default")]
     pub listen: Vec<String>,
-    /// Hosts that this one connects to. One that is up is enough: it names the others. At most 64.
+    /// Hosts that this one connects to, in the form of `listen`. At most 64; hosts may name each other.
+    ///
+    /// One that is up is enough to join: it names the others, and they connect among themselves. But a lost link is only
+    /// tried again, for ever, to a host that is named here; one that was made by hearsay waits until the two hear of each
+    /// other again. So name the I/O hosts, and every other host that has a fixed address.
     #[serde(default)]
     pub connect: Vec<String>,
     /// Also look for hosts by multicast (224.0.0.224, UDP port 7446). Off unless wanted: a plant network is not ours to
@@ -114,6 +118,11 @@ impl Config {
             // Hosts that know one common host learn of each other from it, and connect.
             ("scouting/gossip/enabled", "true".to_owned()),
             ("scouting/gossip/autoconnect", r#"["router", "peer"]"#.to_owned()),
+            // One of two connects, not both at once: crossing connections close each other, and take messages with them.
+            (
+                "scouting/gossip/autoconnect_strategy",
+                r#"{"peer": {"to_router": "always", "to_peer": "greater-zid"}}"#.to_owned(),
+            ),
             // Records carry their own times.
             ("timestamping/enabled", "false".to_owned()),
             ("transport/link/tx/lease", self.lease_ms.to_string()),

@@ -15,7 +15,7 @@
 use std::{collections::HashMap, sync::Arc};
 
 use bumpless_core::{HostId, LoopId};
-use parking_lot::RwLock;
+use parking_lot::{Mutex, RwLock};
 use zenoh::{
     Wait,
     pubsub::Publisher,
@@ -60,6 +60,9 @@ pub(crate) struct Lanes {
     host: HostId,
     hosts: RwLock<HashMap<HostId, Arc<HostLanes>>>,
     records: RwLock<HashMap<LoopId, Arc<Publisher<'static>>>>,
+    /// Held while lanes are declared or let go. Two declarations of one key at a time confuse Zenoh: an interest is taken
+    /// back before it was sent, and what was sent between is lost.
+    declaring: Mutex<()>,
     vitals: Publisher<'static>,
     notice: Publisher<'static>,
 }
@@ -74,6 +77,7 @@ impl Lanes {
             host,
             hosts: RwLock::default(),
             records: RwLock::default(),
+            declaring: Mutex::default(),
         })
     }
 
@@ -84,23 +88,7 @@ impl Lanes {
 
     /// Sends a record to all.
     pub(crate) fn record(&self, zenoh: &zenoh::Session, id: &LoopId, bytes: Vec<u8>) -> Result<(), Error> {
-        let cached = self.records.read().get(id).cloned();
-        let publisher = match cached {
-            Some(publisher) => publisher,
-            None => {
-                // Declared outside the lock, so that no other loop waits for it.
-                let key = self.keys.build(&Key::Record(id.clone()));
-                let publisher = Arc::new(declare(zenoh, key, Priority::RealTime, Locality::Remote)?);
-                let mut records = self.records.write();
-                if records.len() >= RECORD_LANES_MAX {
-                    return Err(Error::TooMany {
-                        what: "record lanes",
-                        limit: RECORD_LANES_MAX,
-                    });
-                }
-                records.entry(id.clone()).or_insert(publisher).clone()
-            }
-        };
+        let publisher = self.record_lane(zenoh, id)?;
         put(&publisher, "record", bytes)
     }
 
@@ -119,20 +107,56 @@ impl Lanes {
 
     /// Lets the lanes to a host go. They come back by themselves if they are used.
     pub(crate) fn forget_host(&self, to: &HostId) {
-        // Undeclared when the value is dropped: after the lock.
+        let _declaring = self.declaring.lock();
+        // Undeclared when the value is dropped: after the lock that senders take.
         let gone = self.hosts.write().remove(to);
         drop(gone);
     }
 
     /// Lets the record lane of a loop go.
     pub(crate) fn forget_loop(&self, id: &LoopId) {
+        let _declaring = self.declaring.lock();
         let gone = self.records.write().remove(id);
         drop(gone);
     }
 
+    fn record_lane(&self, zenoh: &zenoh::Session, id: &LoopId) -> Result<Arc<Publisher<'static>>, Error> {
+        let known = || self.records.read().get(id).cloned();
+        if let Some(lane) = known() {
+            return Ok(lane);
+        }
+        let _declaring = self.declaring.lock();
+        // Another thread may have been first.
+        if let Some(lane) = known() {
+            return Ok(lane);
+        }
+        if self.records.read().len() >= RECORD_LANES_MAX {
+            return Err(Error::TooMany {
+                what: "record lanes",
+                limit: RECORD_LANES_MAX,
+            });
+        }
+        // Declared outside the lock that senders take, so that no other loop waits for it.
+        let key = self.keys.build(&Key::Record(id.clone()));
+        let lane = Arc::new(declare(zenoh, key, Priority::RealTime, Locality::Remote)?);
+        self.records.write().insert(id.clone(), Arc::clone(&lane));
+        Ok(lane)
+    }
+
     fn host_lanes(&self, zenoh: &zenoh::Session, to: &HostId) -> Result<Arc<HostLanes>, Error> {
-        if let Some(lanes) = self.hosts.read().get(to) {
-            return Ok(Arc::clone(lanes));
+        let known = || self.hosts.read().get(to).cloned();
+        if let Some(lanes) = known() {
+            return Ok(lanes);
+        }
+        let _declaring = self.declaring.lock();
+        if let Some(lanes) = known() {
+            return Ok(lanes);
+        }
+        if self.hosts.read().len() >= HOSTS_MAX {
+            return Err(Error::TooMany {
+                what: "hosts",
+                limit: HOSTS_MAX,
+            });
         }
         let lane = |lane| {
             let key = self.keys.build(&Key::Direct {
@@ -150,14 +174,8 @@ impl Lanes {
             ping: lane(Lane::Ping)?,
             pong: lane(Lane::Pong)?,
         });
-        let mut hosts = self.hosts.write();
-        if hosts.len() >= HOSTS_MAX && !hosts.contains_key(to) {
-            return Err(Error::TooMany {
-                what: "hosts",
-                limit: HOSTS_MAX,
-            });
-        }
-        Ok(Arc::clone(hosts.entry(to.clone()).or_insert(lanes)))
+        self.hosts.write().insert(to.clone(), Arc::clone(&lanes));
+        Ok(lanes)
     }
 }
 

@@ -3,13 +3,14 @@
 //! Never: asks the network.
 //!
 //! ```text
-//!          token                      last token gone
-//! absent ────────► present(instance) ────────────────► absent
+//!          token                       last token gone
+//! absent ────────► present(instance) ─────────────────► absent
 //!                   │        ▲
-//!                   └────────┘ younger instance: Down, then Up
+//!                   └────────┘ oldest token gone, a younger one left: Down, then Up
 //! ```
 //!
-//! A host that restarts within its own lease shows two tokens for a while. The younger counts.
+//! Two tokens of one name are a restart within the lease, or a namesake that is about to leave. The older counts until it
+//! goes: a restart is told once the old life is over, and a namesake disturbs nobody.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -52,9 +53,9 @@ impl Members {
 
     fn change(&mut self, host: &HostId, edit: impl FnOnce(&mut BTreeSet<Instance>)) -> Vec<Change> {
         let lives = self.lives.entry(host.clone()).or_default();
-        let before = lives.last().cloned();
+        let before = lives.first().cloned();
         edit(lives);
-        let after = lives.last().cloned();
+        let after = lives.first().cloned();
         if lives.is_empty() {
             self.lives.remove(host);
         }
@@ -79,21 +80,22 @@ mod tests {
         let (up, down) = (Change::Up(host.clone()), Change::Down(host.clone()));
         let (first, second) = (Instance::new(1, 7), Instance::new(2, 3));
         let mut members = Members::default();
-        assert_eq!(members.appear(&host, first.clone()), [up.clone()]);
+        assert_eq!(members.appear(&host, first.clone()), vec![up.clone()]);
         assert_eq!(members.appear(&host, first.clone()), [], "a token that is repeated");
-        assert_eq!(members.hosts(), [host.clone()]);
+        assert_eq!(members.hosts(), vec![host.clone()]);
         assert_eq!(
             members.appear(&host, second.clone()),
-            [down.clone(), up.clone()],
-            "a restart"
+            [],
+            "a namesake, or a restart that is not over"
         );
-        assert_eq!(members.vanish(&host, &first), [], "the old life's token ends late");
-        assert_eq!(members.vanish(&host, &second), [down.clone()]);
-        assert_eq!(members.vanish(&host, &second), [], "a token that went before");
-        assert!(members.hosts().is_empty());
-        // A frozen old life under a young one that ends: the old one counts again.
-        members.appear(&host, first.clone());
+        assert_eq!(members.vanish(&host, &second), [], "the namesake leaves");
         members.appear(&host, second.clone());
-        assert_eq!(members.vanish(&host, &second), [down, up]);
+        assert_eq!(members.vanish(&host, &first), [down.clone(), up.clone()], "a restart");
+        assert_eq!(members.vanish(&host, &first), [], "a token that went before");
+        // A frozen life that goes on is the older one again.
+        assert_eq!(members.appear(&host, first.clone()), [down.clone(), up]);
+        assert_eq!(members.vanish(&host, &second), []);
+        assert_eq!(members.vanish(&host, &first), [down]);
+        assert!(members.hosts().is_empty());
     }
 }

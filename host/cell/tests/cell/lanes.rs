@@ -131,9 +131,9 @@ async fn own_news_does_not_come_back_but_a_message_to_oneself_does() {
 
 #[tokio::test]
 async fn a_third_host_does_not_hear_what_is_not_for_it() {
-    let (a, b) = pair("third").await;
+    let (mut a, b) = pair("third").await;
     let mut c = Peer::join("third", "c", &[&a, &b]).await;
-    c.wait_up("a").await;
+    a.wait_up("c").await;
     a.session.send_sample(b.name(), &sample(a.name(), b.name(), 1));
     a.session.send_step(b.name(), &step_request(a.name(), 1));
     a.session.ping(b.name(), 1);
@@ -185,6 +185,40 @@ async fn one_lane_keeps_its_order() {
     })
     .await;
     assert!(found.is_sorted_by(|a, b| a < b), "{found:?}");
+}
+
+#[tokio::test]
+async fn the_first_messages_of_many_threads_all_arrive() {
+    let (a, mut b) = pair("threads").await;
+    let to = b.name().clone();
+    let start = std::sync::Barrier::new(8);
+    // All of them find no lane and want to declare it.
+    std::thread::scope(|threads| {
+        for token in 0..8 {
+            let (session, to, start) = (&a.session, &to, &start);
+            threads.spawn(move || {
+                start.wait();
+                session.ping(to, token);
+                session.publish_record(&record(to, token, vec![]));
+            });
+        }
+    });
+    let (mut pings, mut records) = (Vec::new(), Vec::new());
+    b.wait_for("eight of each", |x| {
+        match x {
+            Arrival::Ping { token, .. } => pings.push(token),
+            Arrival::Record(record) => records.push(record.seq),
+            _ => {}
+        }
+        (pings.len() == 8 && records.len() == 8).then_some(())
+    })
+    .await;
+    pings.sort_unstable();
+    records.sort_unstable();
+    assert!(
+        pings.iter().copied().eq(0..8) && records.iter().copied().eq(0..8),
+        "{pings:?} {records:?}"
+    );
 }
 
 #[tokio::test]
