@@ -36,7 +36,7 @@ pub(super) fn run(feed: &Feed, mut story: Story, json: bool, cycles: Option<u64>
             }
             News::Connected(api) => story.connected(api),
             News::Disconnected(reason) => story.disconnected(&reason),
-            News::Gone(reason) => return Err(story.gone(reason)),
+            News::Gone(reason) => return Err(story.gone(&reason)),
         }
         if !json {
             let new = usize::try_from(story.happened_count - told)

@@ -47,7 +47,7 @@ pub(super) fn run(feed: &Feed, mut story: Story, cycles: Option<u64>) -> Result<
             let next = Instant::now() + FRAME;
             while let Some(left) = next.checked_duration_since(Instant::now()) {
                 match feed.next(left.min(Duration::from_millis(20))) {
-                    Some(News::Gone(reason)) => return Err(story.gone(reason)),
+                    Some(News::Gone(reason)) => return Err(story.gone(&reason)),
                     Some(news) => take(&mut story, news),
                     None if keys(&mut story).map_err(failed)? => return Ok(()),
                     None => {}

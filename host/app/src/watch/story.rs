@@ -206,7 +206,7 @@ impl Story {
     }
 
     /// No host answers any more.
-    pub(super) fn gone(&self, reason: String) -> Error {
+    pub(super) fn gone(&self, reason: &str) -> Error {
         Error::Unreachable {
             api: self.api.clone(),
             reason: format!("nor any other host of the cell; {reason}"),
