@@ -6,7 +6,7 @@
 
 use std::{env, fs, path::Path, time::Duration};
 
-use rustix::process::{Resource, Rlimit, Signal, nice, set_parent_process_death_signal, setrlimit};
+use rustix::process::{Resource, Rlimit, Signal, set_parent_process_death_signal, setpriority_process, setrlimit};
 
 use crate::{Error, Limits, Profile, compile::precompile};
 
@@ -70,7 +70,8 @@ fn confine(memory_bytes: u64, time: Duration) -> Result<(), Error> {
         )
         .map_err(|error| refused("a limit of the compiler process cannot be set", error))
     };
-    nice(19).map_err(|error| refused("the compiler process cannot lower its priority", error))?;
+    // Absolute: the host that started this process may itself run before other work.
+    setpriority_process(None, 19).map_err(|error| refused("the compiler process cannot lower its priority", error))?;
     set_parent_process_death_signal(Some(Signal::KILL))
         .map_err(|error| refused("the compiler process cannot be bound to its parent", error))?;
     limit(Resource::Core, 0)?;

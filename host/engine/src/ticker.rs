@@ -60,7 +60,7 @@ fn run(engine: &wasmtime::Engine, stop: &AtomicBool) {
     if let Err(error) = set_current_timer_slack(NonZeroU64::new(1)) {
         tracing::debug!(%error, "timer slack of the epoch thread stays as it is");
     }
-    if let Err(error) = rustix::process::nice(-15) {
+    if let Err(error) = rustix::process::setpriority_process(None, -15) {
         tracing::debug!(%error, "priority of the epoch thread stays as it is");
     }
     let mut next = clock_gettime(ClockId::Monotonic);

@@ -62,12 +62,13 @@ impl Replicas {
         self.entry(host).lock().health.failed(now_ns, waited_ns);
     }
 
-    /// The hosts to probe now, each with a token to send. A probe that got lost counts as a failure first.
-    pub(crate) fn probes(&self, now_ns: u64) -> Vec<(HostId, u64)> {
+    /// The hosts to probe now, all but this one, each with a token to send. A probe that got lost counts as a failure first.
+    pub(crate) fn probes(&self, here: &HostId, now_ns: u64) -> Vec<(HostId, u64)> {
         let hosts: Vec<_> = self
             .hosts
             .read()
             .iter()
+            .filter(|(h, _)| *h != here)
             .map(|(h, r)| (h.clone(), Arc::clone(r)))
             .collect();
         let mut due = Vec::new();

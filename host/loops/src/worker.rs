@@ -128,10 +128,8 @@ impl Worker {
                 Timer::Seat(id) => self.seat_due(&id, at_ns, now_ns),
                 Timer::Call(correlation) => self.call_due(correlation, now_ns),
                 Timer::Probe => {
-                    for (host, token) in self.shared.replicas.probes(now_ns) {
-                        if host != self.shared.here {
-                            self.shared.wire.ping(&host, token);
-                        }
+                    for (host, token) in self.shared.replicas.probes(&self.shared.here, now_ns) {
+                        self.shared.wire.ping(&host, token);
                     }
                     self.at(now_ns + PROBE_NS, Timer::Probe);
                 }
