@@ -3,24 +3,55 @@
 use std::{collections::BTreeMap, sync::Arc};
 
 use bumpless_cell::{Roles, Session};
-use bumpless_core::{BusId, CommandBody, HostId};
+use bumpless_core::{BusId, CommandBody, HostId, Record};
 use bumpless_deploy::{Change, Deploy, DeployArrival, Error, Parts};
 use bumpless_io::{Clock, IoServer};
-use bumpless_loops::Loops;
+use bumpless_loops::{Loops, LoopsEvent};
 use bumpless_store::{RecordWriter, Store};
 use parking_lot::Mutex;
 
 use crate::harness::{Cell, component, draft, engine, id, until};
 
-type Slot = Arc<Mutex<Option<Deploy>>>;
+type Slot<T> = Arc<Mutex<Option<T>>>;
+
+struct Real {
+    deploy: Deploy,
+    loops: Loops,
+    session: Session,
+    writer: Arc<RecordWriter>,
+    slots: (Slot<Deploy>, Slot<Loops>),
+    /// The first record that was taken.
+    first: Slot<Arc<Record>>,
+}
+
+impl Real {
+    async fn stop(self) {
+        let Self {
+            deploy,
+            loops,
+            session,
+            writer,
+            slots,
+            first: _,
+        } = self;
+        deploy.shutdown().await;
+        tokio::task::spawn_blocking(move || loops.stop()).await.unwrap();
+        session.close().await;
+        // Loops and bus know deployment, which knows them.
+        *slots.0.lock() = None;
+        *slots.1.lock() = None;
+        drop((deploy, slots));
+        until("the disk is let go", || (Arc::strong_count(&writer) == 1).then_some(())).await;
+    }
+}
 
 /// One host that serves points and runs controllers.
-async fn host(cell: &Cell, dir: &std::path::Path) -> (Deploy, Loops) {
-    let slot: Slot = Arc::default();
-    let loops_slot: Arc<Mutex<Option<Loops>>> = Arc::default();
+async fn host(cell: &Cell, dir: &std::path::Path) -> Real {
+    let slot: Slot<Deploy> = Arc::default();
+    let loops_slot: Slot<Loops> = Arc::default();
     let (deploy, loops) = (Arc::clone(&slot), Arc::clone(&loops_slot));
     let sink = Arc::new(move |arrival| {
-        let left = loops.lock().clone().map_or(None, |loops| loops.arrive(arrival));
+        let left = loops.lock().clone().and_then(|loops| loops.arrive(arrival));
         if let (Some(left), Some(deploy)) = (left, deploy.lock().clone()) {
             deploy.arrive(DeployArrival::Bus(left));
         }
@@ -34,7 +65,12 @@ async fn host(cell: &Cell, dir: &std::path::Path) -> (Deploy, Loops) {
     };
     let io = Arc::new(IoServer::open(&config, clock, &tokio::runtime::Handle::current()).unwrap());
     let deploy = Arc::clone(&slot);
+    let first: Slot<Arc<Record>> = Arc::default();
+    let taken = Arc::clone(&first);
     let events = Arc::new(move |event| {
+        if let LoopsEvent::Record(record) = &event {
+            taken.lock().get_or_insert_with(|| Arc::clone(record));
+        }
         if let Some(deploy) = deploy.lock().clone() {
             deploy.arrive(DeployArrival::Loops(event));
         }
@@ -53,9 +89,10 @@ async fn host(cell: &Cell, dir: &std::path::Path) -> (Deploy, Loops) {
     .unwrap();
     *loops_slot.lock() = Some(loops.clone());
     let store = Store::open(dir).unwrap();
+    let writer = Arc::new(RecordWriter::start(store.clone()).unwrap());
     let deploy = Deploy::start(Parts {
-        session,
-        writer: Arc::new(RecordWriter::start(store.clone()).unwrap()),
+        session: session.clone(),
+        writer: Arc::clone(&writer),
         store,
         engine,
         io: Some(io),
@@ -70,13 +107,21 @@ async fn host(cell: &Cell, dir: &std::path::Path) -> (Deploy, Loops) {
     })
     .unwrap();
     *slot.lock() = Some(deploy.clone());
-    (deploy, loops)
+    Real {
+        deploy,
+        loops,
+        session,
+        writer,
+        slots: (slot, loops_slot),
+        first,
+    }
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_loop_runs_is_commanded_changed_swapped_and_deleted() {
     let (cell, disk) = (Cell::new(), tempfile::tempdir().unwrap());
-    let (deploy, loops) = host(&cell, &disk.path().join("io")).await;
+    let real = host(&cell, &disk.path().join("io")).await;
+    let (deploy, loops) = (&real.deploy, &real.loops);
     for name in ["pid", "pidplus", "on-off"] {
         deploy.upload(component(name), "t", "").await.unwrap();
     }
@@ -131,6 +176,43 @@ async fn a_loop_runs_is_commanded_changed_swapped_and_deleted() {
     assert!((deploy.call(call).await.unwrap().outputs["out"] - 40.0).abs() < 1e-6);
     deploy.delete(&l).await.unwrap();
     assert!(deploy.loops().is_empty() && loops.home_view(&l).is_none());
-    deploy.shutdown().await;
-    tokio::task::spawn_blocking(move || loops.stop()).await.unwrap();
+    real.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_loop_goes_on_after_a_restart_of_everything() {
+    let (cell, disk) = (Cell::new(), tempfile::tempdir().unwrap());
+    let real = host(&cell, &disk.path().join("io")).await;
+    real.deploy.upload(component("pid"), "t", "").await.unwrap();
+    real.deploy.apply(draft("l", "pid", "io", 0)).await.unwrap();
+    let l = id("l");
+    let end = real
+        .deploy
+        .command(&l, None, CommandBody::Setpoint(60.0))
+        .await
+        .unwrap();
+    real.stop().await;
+    let before = Store::open(&disk.path().join("io"))
+        .unwrap()
+        .last_record(&l)
+        .unwrap()
+        .expect("a record");
+    assert!(before.position() >= end.position);
+
+    let real = host(&cell, &disk.path().join("io")).await;
+    let after = until("a cycle runs", || real.first.lock().clone()).await;
+    // The same cell goes on from the very record that the actuator saw last, with what the operator had set.
+    assert_eq!((after.after, after.setpoint), (before.position(), 60.0));
+    assert!(
+        after.term > before.term && after.seq > before.seq,
+        "{:?}",
+        after.position()
+    );
+    let again = real
+        .deploy
+        .command(&l, Some(end.applied.id), CommandBody::Setpoint(60.0))
+        .await
+        .unwrap();
+    assert_eq!(again.applied, end.applied, "and with the outcomes of its commands");
+    real.stop().await;
 }
