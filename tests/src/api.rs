@@ -57,6 +57,8 @@ impl Api {
     pub fn new(base: impl Into<String>) -> Self {
         let agent = ureq::Agent::config_builder()
             .http_status_as_error(false)
+            // The hosts are on this machine; proxies are for the world outside.
+            .proxy(None)
             .timeout_connect(Some(Duration::from_secs(5)))
             .timeout_global(Some(REQUEST_MAX))
             .build()

@@ -41,6 +41,7 @@ impl Feed {
     pub fn open(url: &str, last_event_id: Option<&str>) -> Result<Self, Error> {
         let agent: ureq::Agent = ureq::Agent::config_builder()
             .http_status_as_error(false)
+            .proxy(None)
             .timeout_connect(Some(Duration::from_secs(5)))
             .timeout_recv_response(Some(WAIT_MAX))
             // A feed says something every second.
