@@ -13,6 +13,13 @@
 //! | guides | the commands in the documentation |
 //! | house | the rules of the source itself |
 
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    reason = "a test fails loudly"
+)]
+
 mod calls;
 mod guides;
 mod house;

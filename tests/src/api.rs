@@ -137,10 +137,10 @@ impl Api {
         } else {
             &[]
         };
-        self.success(method, path, self.send(method, path, headers, text.as_bytes())?)
+        self.success(method, path, &self.send(method, path, headers, text.as_bytes())?)
     }
 
-    fn success(&self, method: &str, path: &str, answer: Answer) -> Result<Value, Error> {
+    fn success(&self, method: &str, path: &str, answer: &Answer) -> Result<Value, Error> {
         let url = format!("{}{path}", self.base);
         if !answer.ok() {
             return Err(Error::Refused {
@@ -199,7 +199,7 @@ impl Api {
     pub fn upload_bytes(&self, bytes: &[u8]) -> Result<Value, Error> {
         let path = "/v1/components";
         let answer = self.send("POST", path, &[("content-type", "application/wasm")], bytes)?;
-        self.success("POST", path, answer)
+        self.success("POST", path, &answer)
     }
 
     /// Uploads a component from a file.
@@ -369,7 +369,7 @@ impl Api {
         if answer.ok() {
             Ok(answer.text())
         } else {
-            self.success("GET", "/metrics", answer).map(|_| String::new())
+            self.success("GET", "/metrics", &answer).map(|_| String::new())
         }
     }
 

@@ -22,7 +22,7 @@ use std::{
 use rustix::process::{Pid, Signal, kill_process};
 use serde::Deserialize;
 
-use crate::{Api, Binary, Error, journal, wait_until};
+use crate::{Api, Binary, Error, Watchdog, journal, wait_until};
 
 /// Longest time until a host is ready: it opens its store, finds the others and compiles what it must hold.
 const READY_MAX: Duration = Duration::from_secs(30);
@@ -79,7 +79,7 @@ pub struct HostProcess {
 #[derive(Debug)]
 struct Running {
     child: Child,
-    watchdog: Child,
+    watchdog: Watchdog,
     ready: Receiver<String>,
 }
 
@@ -157,7 +157,7 @@ impl HostProcess {
         command.envs(self.options.environment.iter().map(|(name, value)| (name, value)));
         let program = self.binary.path().display().to_string();
         let mut child = command.spawn().map_err(|source| Error::Program { program, source })?;
-        let watchdog = match watchdog(&child) {
+        let watchdog = match Watchdog::over(&child) {
             Ok(watchdog) => watchdog,
             Err(error) => {
                 // The child has nothing yet that could be lost.
@@ -383,9 +383,8 @@ impl HostProcess {
     fn end(&mut self) {
         if let Some(mut running) = self.running.take() {
             // The watchdog first, so that it never kills a stranger with the same number.
-            for child in [&mut running.watchdog, &mut running.child] {
-                let _gone = child.kill().and_then(|()| child.wait());
-            }
+            drop(running.watchdog);
+            let _gone = running.child.kill().and_then(|()| running.child.wait());
         }
     }
 }
@@ -399,18 +398,4 @@ impl Drop for HostProcess {
             eprintln!("{}", self.stderr_tail());
         }
     }
-}
-
-/// A shell that waits for the end of its input, which comes when this process is gone, and then kills the host.
-fn watchdog(host: &Child) -> Result<Child, Error> {
-    std::process::Command::new("sh")
-        .args(["-c", "read -r _; kill -9 \"$0\"", &host.id().to_string()])
-        .stdin(Stdio::piped())
-        .stdout(Stdio::null())
-        .stderr(Stdio::null())
-        .spawn()
-        .map_err(|source| Error::Program {
-            program: "sh".to_owned(),
-            source,
-        })
 }

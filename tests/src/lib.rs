@@ -18,6 +18,7 @@ mod host;
 mod journal;
 mod slots;
 mod wait;
+mod watchdog;
 
 use std::path::PathBuf;
 
@@ -29,6 +30,7 @@ pub use feed::{Event, Feed};
 pub use host::{HostOptions, HostProcess};
 pub use journal::{Gap, Journal, Violation, Write};
 pub use wait::{POLL, WAIT_MAX, pause, wait_until};
+pub use watchdog::Watchdog;
 
 /// The folder with the components, built where they are not: `pid.wasm` and so on, and `guests/traps.wasm` and so on.
 ///

@@ -33,7 +33,7 @@ pub fn bench(arguments: &[String]) -> Result<(), Error> {
     run(&mut cargo(
         "build --release --package bumpless-app --package bumpless-bench",
     ))?;
-    run(cargo("run --release --quiet --package bumpless-bench --").args(arguments))
+    run(program(target_folder().join("release/bumpless-bench")).args(arguments))
 }
 
 /// Writes `docs/openapi.json` from the code.

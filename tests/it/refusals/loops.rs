@@ -4,7 +4,7 @@ use bumpless_tests::{Api, components, first_order_loop};
 use serde_json::{Value, json};
 
 use super::problem;
-use crate::{text, whole};
+use crate::{number, settle, text, whole};
 
 type Change = fn(&mut Value);
 
@@ -222,34 +222,64 @@ pub(super) fn bad_changes(api: &Api) {
     );
 }
 
-/// Components that are fine until they run: the loop stays with, or goes back to, the one that works.
+/// Components that are fine until they run: the loop stays with, or goes back to, the one that works, and the output of a
+/// settled loop stays where it is.
 pub(super) fn misdeeds(api: &Api) {
+    const LOOP: &str = "loop-1";
     let folder = components().unwrap();
-    let guests = ["traps", "returns-nan", "spins", "fails-start", "bad-state"];
+    let mut draft = first_order_loop(1, "pid", 50.0);
+    api.apply(&draft).unwrap();
+    settle(api, LOOP, 1.0);
+    let guests = [
+        "traps",
+        "returns-nan",
+        "spins",
+        "fails-start",
+        "bad-state",
+        "recurses",
+        "grows-memory",
+    ];
     for guest in guests {
         api.upload(&folder.join(format!("guests/{guest}.wasm"))).unwrap();
-    }
-    for guest in guests {
-        let before = api.loop_view("loop-0").unwrap();
-        let done = api.swap("loop-0", guest);
-        let then = api
-            .wait_for_loop("loop-0", &format!("pid after {guest}"), |view| {
-                text(&view["component"]).starts_with("pid@") && view["pending_revision"].is_null()
-            })
-            .unwrap();
+        let before = api.loop_view(LOOP).unwrap();
+        let done = api.swap(LOOP, guest);
+        let then = with_pid_again(api, LOOP, guest);
         if let Err(error) = &done {
             assert_eq!(error.status(), 409, "{guest}: {error}");
             assert_eq!(then["revision"], before["revision"], "{guest}");
         }
-        let seq = whole(&then["seq"]);
-        api.wait_for_loop("loop-0", &format!("cycles after {guest}"), |view| {
-            view["seq"].as_u64() > Some(seq + 3)
+    }
+    // One that is good for a while, so that it comes into force, and traps in its probation.
+    api.upload(&folder.join("guests/jumps.wasm")).unwrap();
+    let feed = api.live("?loops=loop-1").unwrap();
+    draft["component"] = json!("jumps");
+    draft["parameters"] = json!({ "after": 5 });
+    let done = api.apply(&draft).unwrap();
+    assert_eq!(done["hand_over"]["by"], "start", "{done}");
+    let record = feed
+        .record_where("the way back", |record| {
+            let events = record["events"].as_array().unwrap();
+            events.iter().any(|event| event["kind"] == "rolled-back")
         })
         .unwrap();
-        assert_eq!(
-            api.loop_view("loop-0").unwrap()["outputs"]["out"],
-            40.0,
-            "{guest} did not move the output"
-        );
-    }
+    assert!(record.to_string().contains("trap"), "it says why: {record}");
+    with_pid_again(api, LOOP, "jumps");
+    api.delete("/v1/loops/loop-1").unwrap();
+}
+
+fn with_pid_again(api: &Api, name: &str, guest: &str) -> Value {
+    let then = api
+        .wait_for_loop(name, &format!("pid after {guest}"), |view| {
+            text(&view["component"]).starts_with("pid@") && view["pending_revision"].is_null()
+        })
+        .unwrap();
+    let seq = whole(&then["seq"]);
+    let later = api
+        .wait_for_loop(name, &format!("cycles after {guest}"), |view| {
+            view["seq"].as_u64() > Some(seq + 5)
+        })
+        .unwrap();
+    let out = number(&later["outputs"]["out"]);
+    assert!((out - 40.0).abs() < 4.0, "{guest} moved the output to {out}");
+    then
 }

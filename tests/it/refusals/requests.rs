@@ -4,12 +4,14 @@ use bumpless_tests::Api;
 
 const JSON: (&str, &str) = ("content-type", "application/json");
 
+/// Method, address, headers and body; the status of the answer, and a part of its words.
+type Row<'a> = (&'a str, &'a str, &'a [(&'a str, &'a str)], &'a [u8], u16, &'a str);
+
 pub(super) fn refused(api: &Api) {
     let setpoint = "/v1/loops/loop-0/setpoint";
     let long = vec![b' '; 300 * 1024];
     let good: &[u8] = b"{\"setpoint\": 40}";
-    type Headers<'a> = &'a [(&'a str, &'a str)];
-    let table: [(&str, &str, Headers<'_>, &[u8], u16, &str); 17] = [
+    let table: [Row<'_>; 17] = [
         ("GET", "/v1/nothing", &[], b"", 404, "no address of this API"),
         (
             "GET",
