@@ -107,6 +107,9 @@ fn run(bench: &Bench, options: Options) -> Result<bool, Error> {
         Bench::Burn { core } => return stress::burn(*core).map(|()| true),
         Bench::CallPeer { component } => return peer::run(component).map(|()| true),
     };
+    if matches!(bench, Bench::Call | Bench::Step) {
+        stall::as_a_host();
+    }
     let conditions = Conditions::now(name, options.quick);
     let mut report = Report::begin(&conditions, options.json);
     match bench {

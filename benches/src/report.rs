@@ -181,7 +181,8 @@ fn short(value: f64) -> String {
         v if v >= 100.0 => 1,
         v if v >= 10.0 => 2,
         v if v >= 0.1 => 3,
-        _ => 6,
+        v if v >= 1e-4 => 6,
+        _ => return format!("{value:.1e}"),
     };
     format!("{value:.digits$}")
 }

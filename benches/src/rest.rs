@@ -1,12 +1,12 @@
-//! The same step through the REST API: `POST /v1/components/pid/call` on a host that has no replica of its own, so that the
-//! step is remote; one after the other, and from 64 clients at once.
+//! The same step through the REST API: `POST /v1/components/pid/call` on the plant's host, stepped on the controller's; one
+//! after the other, and from 64 clients at once.
 //!
 //! The clients are threads of this process on the same machine: their processor time is part of what is measured.
 
 use std::time::{Duration, Instant};
 
 use bumpless_tests::{Api, Cell, CellOptions};
-use serde_json::{Value, json};
+use serde_json::json;
 
 use crate::{
     Options,
@@ -35,6 +35,15 @@ pub(crate) fn run(options: Options, report: &mut Report) -> Result<(), Error> {
     let cell = Cell::start(CellOptions::default().controllers(1))?;
     let api = cell.plant.api();
     api.upload_stock(&["pid"])?;
+    // A replica is where a loop is held, so there is one, once a second.
+    api.apply(&json!({
+        "name": "keeper",
+        "component": "pid",
+        "period_ms": 1000.0,
+        "ports": { "pv": "plant.pit129", "out": "plant.p1" },
+        "parameters": { "out-high": 10.0 },
+        "setpoint": 0.5,
+    }))?;
     let mut request = json!({
         "inputs": { "pv": 49.0 },
         "setpoint": 50.0,
@@ -42,8 +51,13 @@ pub(crate) fn run(options: Options, report: &mut Report) -> Result<(), Error> {
         "track": { "out": 30.0 },
     });
     // The first call makes the state that all others go on from.
-    let first = bumpless_tests::wait_until("a first call", PATIENCE, || {
-        api.call("pid", &request).map_err(|error| error.to_string())
+    let first = bumpless_tests::wait_until("a first step on the controller", PATIENCE, || {
+        let answer = api.call("pid", &request).map_err(|error| error.to_string())?;
+        if answer["host"] == bumpless_tests::PLANT {
+            Err("the plant's host stepped itself".to_owned())
+        } else {
+            Ok(answer)
+        }
     })?;
     request["state"] = first["state"].clone();
     let path = "/v1/components/pid/call";
@@ -110,7 +124,7 @@ fn client(api: &Api, path: &str, body: &str, calls: u64) -> Measured {
         match answer {
             Ok(answer) if answer.ok() => {
                 measured.seen.add(u64::try_from(elapsed.as_nanos()).unwrap_or(u64::MAX));
-                if answer.json()["host"] == Value::from(bumpless_tests::PLANT) {
+                if answer.json()["host"] == bumpless_tests::PLANT {
                     measured.here += 1;
                 }
             }

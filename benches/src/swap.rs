@@ -151,7 +151,7 @@ pub(crate) fn run(options: Options, report: &mut Report) -> Result<(), Error> {
     let uploader = cell
         .controllers
         .first()
-        .map_or_else(|| cell.plant.api(), |host| host.api());
+        .map_or_else(|| cell.plant.api(), bumpless_tests::HostProcess::api);
     let watch = Watch::start();
     let clock = Clock::start();
     let (mut done, mut uploads) = (Vec::new(), 0);
@@ -170,7 +170,7 @@ pub(crate) fn run(options: Options, report: &mut Report) -> Result<(), Error> {
             .then(|| Uploads::start(uploader.clone(), pid.clone(), uploads))
             .transpose()?;
         let from_ns = clock.now_ns();
-        for swap in 0..swaps / rounds {
+        for swap in number * (swaps / rounds)..(number + 1) * (swaps / rounds) {
             let setpoint = if swap % 2 == 0 { 60.0 } else { 40.0 };
             api.setpoint(LOOP, setpoint)?;
             std::thread::sleep(MID_WAY);
