@@ -31,6 +31,8 @@ mod restarts;
 mod story;
 mod watching;
 
+use std::time::Duration;
+
 use bumpless_tests::{Api, Journal};
 use serde_json::Value;
 
@@ -79,7 +81,9 @@ fn names(list: &Value) -> Vec<String> {
 fn settle(api: &Api, name: &str, band: f64) -> Value {
     let feed = api.live(&format!("?loops={name}")).unwrap();
     let good = std::cell::Cell::new(0);
-    feed.record_where(&format!("{name} within {band} of its setpoint"), |record| {
+    // The simulated vessel needs half a minute by itself.
+    let longest = Duration::from_secs(120);
+    feed.record_within(longest, &format!("{name} within {band} of its setpoint"), |record| {
         let near = matches!(
             (record["measurement"].as_f64(), record["setpoint"].as_f64()),
             (Some(pv), Some(sp)) if (pv - sp).abs() <= band

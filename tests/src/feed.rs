@@ -112,15 +112,35 @@ impl Feed {
     /// # Errors
     /// As [`Feed::next`].
     pub fn record_where(&self, what: &str, is: impl Fn(&Value) -> bool) -> Result<Value, Error> {
+        self.record_within(WAIT_MAX, what, is)
+    }
+
+    /// The next record that is as wanted, with another longest wait: for a plant that takes its time.
+    ///
+    /// # Errors
+    /// As [`Feed::next`].
+    pub fn record_within(&self, longest: Duration, what: &str, is: impl Fn(&Value) -> bool) -> Result<Value, Error> {
         let start = Instant::now();
+        let mut last = Value::Null;
         loop {
-            let left = WAIT_MAX.saturating_sub(start.elapsed());
-            if left.is_zero() {
-                return Err(Error::FeedEnded(format!("no record in {WAIT_MAX:?}: {what}")));
-            }
-            let event = self.next(left)?;
-            if event.name == "record" && is(&event.data) {
-                return Ok(event.data);
+            let left = longest.saturating_sub(start.elapsed());
+            let next = match self.next(left) {
+                Ok(event) => event,
+                Err(error) => {
+                    return Err(Error::FeedEnded(format!(
+                        "{error}; waited for {what}; last seen: {last}"
+                    )));
+                }
+            };
+            if next.name == "record" {
+                if is(&next.data) {
+                    return Ok(next.data);
+                }
+                last = next.data;
+            } else if left.is_zero() {
+                return Err(Error::FeedEnded(format!(
+                    "no record in {longest:?}: {what}; last seen: {last}"
+                )));
             }
         }
     }

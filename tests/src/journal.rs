@@ -85,6 +85,8 @@ pub struct Journal {
     pub refused: Vec<(Write, String)>,
     /// Lines that the host itself could not keep.
     pub dropped: u64,
+    /// Where each life of the host begins: the number of its first write.
+    lives: Vec<usize>,
 }
 
 impl Journal {
@@ -101,6 +103,7 @@ impl Journal {
                 action: "read",
                 source,
             })?;
+            journal.lives.push(journal.writes.len());
             journal.take(&path, &text)?;
         }
         Ok(journal)
@@ -141,31 +144,39 @@ impl Journal {
             .filter(move |w| w.point == point && w.loop_name != ON_STOP)
     }
 
-    /// Every break of the promise of one writer: for each point and loop, terms never go back, and each write has a higher
-    /// cycle number than the one before it. Times never go back either.
+    /// Every break of the promise of one writer. For each point and loop, within one life of the host: terms never go back,
+    /// each write has a higher cycle number than the one before it, and times never go back. From one life to the next the
+    /// term grows; cycle numbers may begin a little earlier, at the last record that reached a disk or another host.
     #[must_use]
     pub fn check_one_writer(&self) -> Vec<Violation> {
-        let mut last: BTreeMap<(&str, &str), &Write> = BTreeMap::new();
+        let mut last: BTreeMap<(&str, &str), (usize, &Write)> = BTreeMap::new();
         let mut violations = Vec::new();
-        for after in self.writes.iter().filter(|w| w.loop_name != ON_STOP) {
-            if let Some(before) = last.insert((&after.point, &after.loop_name), after) {
-                let kind = if after.seq == before.seq {
-                    "two writes of one cycle"
-                } else if after.term < before.term {
-                    "a write of an old ownership"
-                } else if after.seq < before.seq {
-                    "a write of an old cycle"
-                } else if after.at_ns < before.at_ns {
-                    "a write back in time"
-                } else {
-                    continue;
-                };
-                violations.push(Violation {
-                    kind,
-                    before: before.clone(),
-                    after: after.clone(),
-                });
+        for (n, after) in self.writes.iter().enumerate() {
+            if after.loop_name == ON_STOP {
+                continue;
             }
+            let life = self.lives.partition_point(|&first| first <= n);
+            let Some((life_before, before)) = last.insert((&after.point, &after.loop_name), (life, after)) else {
+                continue;
+            };
+            let kind = if life != life_before {
+                (after.term <= before.term).then_some("a write of an ownership of before the restart")
+            } else if after.seq == before.seq {
+                Some("two writes of one cycle")
+            } else if after.term < before.term {
+                Some("a write of an old ownership")
+            } else if after.seq < before.seq {
+                Some("a write of an old cycle")
+            } else if after.at_ns < before.at_ns {
+                Some("a write back in time")
+            } else {
+                None
+            };
+            violations.extend(kind.map(|kind| Violation {
+                kind,
+                before: before.clone(),
+                after: after.clone(),
+            }));
         }
         violations
     }
@@ -300,12 +311,17 @@ mod tests {
     #[test]
     fn files_of_several_starts_are_one_log() {
         let folder = tempfile::tempdir().unwrap();
-        for seq in 0..3 {
+        // A restart may repeat a cycle, with a new term.
+        for (term, seq) in [(1, 0), (2, 1), (5, 1), (5, 2)] {
             keep(folder.path()).unwrap();
-            let text = format!("at_ns,point,value,loop,term,seq\n{seq},p,1,l,1,{seq}\n");
+            let text = format!("at_ns,point,value,loop,term,seq\n{seq},p,1,l,{term},{seq}\n");
             fs::write(folder.path().join(FILE), text).unwrap();
         }
-        let seqs: Vec<u64> = Journal::read(folder.path()).unwrap().of("p").map(|w| w.seq).collect();
-        assert_eq!(seqs, [0, 1, 2]);
+        let journal = Journal::read(folder.path()).unwrap();
+        let seqs: Vec<u64> = journal.of("p").map(|w| w.seq).collect();
+        assert_eq!(seqs, [0, 1, 1, 2]);
+        let found = journal.check_one_writer();
+        assert_eq!(found.len(), 1, "{found:?}");
+        assert_eq!(found[0].kind, "a write of an ownership of before the restart");
     }
 }
