@@ -57,3 +57,20 @@ fn fail(error: &dyn std::error::Error) -> ExitCode {
     }
     ExitCode::FAILURE
 }
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory as _;
+
+    use super::*;
+
+    #[test]
+    fn the_command_line_holds_together_and_passes_on_what_is_not_its_own() {
+        Command::command().debug_assert();
+        let parsed = Command::try_parse_from(["xtask", "bench", "failover", "--quick", "--json"]).expect("good");
+        assert!(matches!(parsed, Command::Bench { arguments } if arguments == ["failover", "--quick", "--json"]));
+        let parsed = Command::try_parse_from(["xtask", "demo", "--for", "5"]).expect("good");
+        assert!(matches!(parsed, Command::Demo { arguments } if arguments == ["--for", "5"]));
+        assert!(Command::try_parse_from(["xtask", "test", "--slow"]).is_err());
+    }
+}
