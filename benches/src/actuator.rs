@@ -119,10 +119,9 @@ mod tests {
             term: 1,
             seq,
         };
-        Journal {
-            writes: writes.iter().map(write).collect(),
-            ..Journal::default()
-        }
+        let mut journal = Journal::default();
+        journal.writes = writes.iter().map(write).collect();
+        journal
     }
 
     #[test]

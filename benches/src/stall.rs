@@ -35,6 +35,7 @@ const STALLS_MAX: usize = 1_000_000;
 #[derive(Debug)]
 pub(crate) struct Watch {
     stop: Arc<AtomicBool>,
+    before: Ticks,
     threads: Vec<JoinHandle<(Vec<Stall>, Spread)>>,
 }
 
@@ -52,6 +53,48 @@ pub(crate) struct Stalls {
     united: Vec<Stall>,
     count: usize,
     lateness: Spread,
+    /// How the processors' time went, over the whole run.
+    ticks: Ticks,
+}
+
+/// Time of all processors together since the machine started, in the kernel's ticks. Source: proc(5), `/proc/stat`.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+struct Ticks {
+    all: u64,
+    idle: u64,
+    /// Taken by other machines on the same hardware.
+    stolen: u64,
+}
+
+impl Ticks {
+    fn now() -> Self {
+        std::fs::read_to_string("/proc/stat").map_or_else(|_| Self::default(), |text| Self::of(&text))
+    }
+
+    /// The first line: user, nice, system, idle, iowait, irq, softirq, steal; what follows is part of the first two.
+    fn of(text: &str) -> Self {
+        let line = text.lines().next().unwrap_or_default();
+        let fields: Vec<u64> = line
+            .split_whitespace()
+            .skip(1)
+            .take(8)
+            .filter_map(|f| f.parse().ok())
+            .collect();
+        let field = |number: usize| fields.get(number).copied().unwrap_or(0);
+        Self {
+            all: fields.iter().sum(),
+            idle: field(3) + field(4),
+            stolen: field(7),
+        }
+    }
+
+    const fn since(self, before: Self) -> Self {
+        Self {
+            all: self.all.saturating_sub(before.all),
+            idle: self.idle.saturating_sub(before.idle),
+            stolen: self.stolen.saturating_sub(before.stolen),
+        }
+    }
 }
 
 impl Watch {
@@ -71,12 +114,17 @@ impl Watch {
                 thread.spawn(move || watch(core, clock, &stop)).ok()
             })
             .collect();
-        Self { stop, threads }
+        Self {
+            stop,
+            before: Ticks::now(),
+            threads,
+        }
     }
 
     /// Ends the threads and gives what they found.
     pub(crate) fn finish(self) -> Stalls {
         self.stop.store(true, Ordering::Relaxed);
+        let ticks = Ticks::now().since(self.before);
         let mut lateness = Spread::new();
         let mut all = Vec::new();
         for thread in self.threads {
@@ -85,7 +133,7 @@ impl Watch {
                 lateness.join(&late);
             }
         }
-        Stalls::of(all, lateness)
+        Stalls::of(all, lateness, ticks)
     }
 }
 
@@ -142,7 +190,7 @@ fn watch(core: usize, clock: Clock, stop: &AtomicBool) -> (Vec<Stall>, Spread) {
 }
 
 impl Stalls {
-    fn of(mut all: Vec<Stall>, lateness: Spread) -> Self {
+    fn of(mut all: Vec<Stall>, lateness: Spread, ticks: Ticks) -> Self {
         let count = all.len();
         all.sort_unstable_by_key(|stall| stall.from_ns);
         let mut united: Vec<Stall> = Vec::with_capacity(count);
@@ -156,6 +204,7 @@ impl Stalls {
             united,
             count,
             lateness,
+            ticks,
         }
     }
 
@@ -179,6 +228,10 @@ impl Stalls {
             longest_ns.unwrap_or(0) as f64 / 1e6,
             "ms",
         );
+        let Ticks { all, idle, stolen } = self.ticks;
+        let percent = |ticks: u64| 100.0 * ticks as f64 / all.max(1) as f64;
+        report.told(&format!("{bench}.machine.busy"), percent(all - idle), "%");
+        report.told(&format!("{bench}.machine.stolen"), percent(stolen), "%");
         for (part, text) in [(0.5, "p50"), (0.99, "p99"), (0.999, "p99_9")] {
             report.told(
                 &format!("{bench}.machine.timer_late.{text}"),
@@ -194,7 +247,7 @@ impl Stalls {
     /// Stalls of the given times, for tests.
     pub(crate) fn of_times(times: &[(u64, u64)]) -> Self {
         let all = times.iter().map(|&(from_ns, to_ns)| Stall { from_ns, to_ns }).collect();
-        Self::of(all, Spread::new())
+        Self::of(all, Spread::new(), Ticks::default())
     }
 }
 
@@ -216,6 +269,29 @@ mod tests {
         ] {
             assert_eq!(stalls.within_ns(from, to), stalled, "{from} to {to}");
         }
+    }
+
+    #[test]
+    fn processor_time_is_read_from_the_first_line() {
+        let before = Ticks::of("cpu  10 1 5 100 4 0 1 2 0 0\ncpu0 1 1 1 1 1 1 1 1 0 0\n");
+        assert_eq!(
+            before,
+            Ticks {
+                all: 123,
+                idle: 104,
+                stolen: 2
+            }
+        );
+        let after = Ticks::of("cpu  20 1 5 180 4 0 1 12 7 0\n");
+        assert_eq!(
+            after.since(before),
+            Ticks {
+                all: 100,
+                idle: 80,
+                stolen: 10
+            }
+        );
+        assert_eq!(Ticks::of(""), Ticks::default());
     }
 
     #[test]
