@@ -39,8 +39,8 @@ pub struct Origin {
 
 /// An instance of a component. It can move between threads, and each thread that calls it needs 1 MiB of stack.
 ///
-/// `limit_ns` bounds each call by the clock; the guest is stopped at the first tick after it, at most 1 ms later on an
-/// idle machine. A call that ends between its limit and the tick is good.
+/// `limit_ns` bounds each call by the clock; a guest that goes on is stopped once it has used half a tick of processor time
+/// beyond it: at most 2 ms later on an idle machine, and never because the machine held it up. A call that ends between its limit and the tick is good.
 pub struct Instance {
     // Dropped in this order: the place is given back only when the store is gone.
     live: Option<Live>,
@@ -148,7 +148,7 @@ impl Instance {
         let Some(live) = &mut self.live else {
             return Err(Fault::Trap("the instance could not be made".to_owned()));
         };
-        live.store.data_mut().deadline = deadline;
+        live.store.data_mut().set_deadline(deadline);
         live.store.set_epoch_deadline(1);
         let outcome = match run(live) {
             Ok(Ok(state)) => Ok(state),

@@ -166,9 +166,8 @@ fn make(core: &Core, pre: &ControllerPre<Sandbox>, ports: Arc<[PortFace]>, deadl
     store.limiter(|sandbox| sandbox);
     store.set_hostcall_fuel(CALL_BYTES_MAX);
     // The epoch is shared by all stores, so a tick only makes a store look at its own deadline.
-    store.epoch_deadline_callback(|context| {
-        let late = Instant::now() >= context.data().deadline;
-        Ok(if late {
+    store.epoch_deadline_callback(|mut context| {
+        Ok(if context.data_mut().is_overdue() {
             UpdateDeadline::Interrupt
         } else {
             UpdateDeadline::Continue(1)

@@ -16,6 +16,7 @@ use bumpless_core::{
     AlarmChange, Cycle, Descriptor, Direction, Effects, Fault, Frame, LogLevel, LogLine, Message, Mode, Reading,
     limits::{LOG_LINES_PER_STEP_MAX, PORTS_MAX, TEXT_CHARS_MAX},
 };
+use rustix::time::{ClockId, clock_gettime};
 use wasmtime::{ResourceLimiter, Trap, WasmBacktrace};
 
 use crate::config::Limits;
@@ -65,7 +66,9 @@ pub(crate) struct Sandbox {
     /// What the guest asked for and did not get, in bytes or elements.
     refused: Option<Refused>,
     /// When the call must be over.
-    pub(crate) deadline: Instant,
+    deadline: Instant,
+    /// The thread's own processor time when the deadline was first seen to have passed, in ns.
+    late_from_ns: Option<u64>,
     pub(crate) call: Call,
     pub(crate) ports: Arc<[PortFace]>,
     pub(crate) cycle: Cycle,
@@ -78,6 +81,20 @@ pub(crate) struct Sandbox {
     pub(crate) alarms: Vec<AlarmChange>,
     pub(crate) log: Vec<LogLine>,
     pub(crate) lines_dropped: u64,
+}
+
+/// Processor time that a guest may still use after its deadline, in ns: half a tick, so that on an idle machine it is
+/// stopped at the second tick after the deadline.
+const OWN_TIME_NS: u64 = 500_000;
+
+/// Processor time of this thread, in ns.
+fn thread_time_ns() -> u64 {
+    let time = clock_gettime(ClockId::ThreadCPUTime);
+    let (seconds, ns) = (u64::try_from(time.tv_sec), u64::try_from(time.tv_nsec));
+    seconds
+        .unwrap_or(0)
+        .saturating_mul(1_000_000_000)
+        .saturating_add(ns.unwrap_or(0))
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -106,6 +123,7 @@ impl Sandbox {
             table_elements_max: limits.table_elements_max,
             refused: None,
             deadline,
+            late_from_ns: None,
             call: Call::Describe,
             ports,
             cycle: NO_CYCLE,
@@ -118,6 +136,24 @@ impl Sandbox {
             log: Vec::new(),
             lines_dropped: 0,
         }
+    }
+
+    /// When the next call must be over.
+    pub(crate) fn set_deadline(&mut self, deadline: Instant) {
+        self.deadline = deadline;
+        self.late_from_ns = None;
+    }
+
+    /// At a tick: shall the guest be stopped? Its deadline must have passed, and it must then have used
+    /// [`OWN_TIME_NS`] of processor time: a guest that was held up by other work of the machine, and is about to end, is
+    /// late but not at fault. Costs nothing before the deadline, where all honest steps end.
+    pub(crate) fn is_overdue(&mut self) -> bool {
+        if Instant::now() < self.deadline {
+            return false;
+        }
+        let used_ns = thread_time_ns();
+        let from_ns = *self.late_from_ns.get_or_insert(used_ns);
+        used_ns.saturating_sub(from_ns) >= OWN_TIME_NS
     }
 
     /// Before any call but a step: nothing to see.
