@@ -278,6 +278,8 @@ impl Desk {
         if let Some(wanted) = self.wanted_owner.take_if(|w| self.members.contains(w))
             && self.arbiter.owner() != Some(&wanted)
         {
+            // Whoever asks for a move knows better than an old silence.
+            self.suspects.retain(|s| s.host != wanted);
             self.arbiter.appoint(wanted);
             resume = true;
         }

@@ -62,10 +62,8 @@ impl Worker {
             ))));
         }
         let now_ns = self.shared.now_ns();
-        let mut members = self.shared.replicas.alive();
-        if !members.contains(&self.shared.here) {
-            members.push(self.shared.here.clone());
-        }
+        // A host without controllers is no candidate, not even this one; `Attempts` falls back to it when nobody else can.
+        let members = self.shared.replicas.controllers();
         let mut candidates = self
             .shared
             .replicas

@@ -283,7 +283,10 @@ impl Loops {
 
     /// What selection needs to know of a host.
     pub fn set_host(&self, vitals: &Vitals) {
-        self.inner.shared.replicas.seen(&vitals.host, vitals.cpu, &vitals.ready);
+        self.inner
+            .shared
+            .replicas
+            .seen(&vitals.host, vitals.roles.control, vitals.cpu, &vitals.ready);
     }
 
     /// A host is gone: homes and cycles look elsewhere at once.

@@ -16,6 +16,7 @@ const PROBE_LOST_NS: u64 = 300_000_000;
 #[derive(Debug, Default)]
 struct Replica {
     alive: bool,
+    control: bool,
     health: Health,
     cpu: f32,
     ready: Vec<Digest>,
@@ -37,10 +38,11 @@ impl Replicas {
     }
 
     /// New vitals of a host.
-    pub(crate) fn seen(&self, host: &HostId, cpu: f32, ready: &[Digest]) {
+    pub(crate) fn seen(&self, host: &HostId, control: bool, cpu: f32, ready: &[Digest]) {
         let entry = self.entry(host);
         let mut replica = entry.lock();
         replica.alive = true;
+        replica.control = control;
         replica.cpu = cpu;
         if replica.ready != ready {
             replica.ready = ready.to_vec();
@@ -123,7 +125,7 @@ impl Replicas {
                     let replica = entry.lock();
                     candidate.cpu = replica.cpu;
                     if !is_here {
-                        candidate.ready = replica.ready.contains(digest);
+                        candidate.ready = replica.control && replica.ready.contains(digest);
                         candidate.closed = replica.health.closed(now_ns);
                         candidate.latency_ns = replica.health.latency_ns();
                     }
@@ -133,13 +135,16 @@ impl Replicas {
             .collect()
     }
 
-    /// Every host that is known to be alive.
-    pub(crate) fn alive(&self) -> Vec<HostId> {
+    /// Every host that is known to be alive and runs controllers.
+    pub(crate) fn controllers(&self) -> Vec<HostId> {
         let mut hosts: Vec<HostId> = self
             .hosts
             .read()
             .iter()
-            .filter(|(_, r)| r.lock().alive)
+            .filter(|(_, r)| {
+                let replica = r.lock();
+                replica.alive && replica.control
+            })
             .map(|(h, _)| h.clone())
             .collect();
         hosts.sort_unstable();

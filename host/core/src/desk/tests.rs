@@ -159,6 +159,17 @@ fn a_planned_move_loses_nothing() {
 }
 
 #[test]
+fn a_planned_move_goes_to_a_host_that_was_silent_before() {
+    let mut desk = desk();
+    let first = next(&mut desk);
+    let again = sent(desk.overdue(first.at_ns + 50));
+    desk.check(&commit(&again)).unwrap();
+    desk.take(again.at_ns + 60, commit(&again));
+    desk.move_to(first.owner.clone());
+    assert_eq!(next(&mut desk).owner, first.owner);
+}
+
+#[test]
 fn commands_ride_until_a_record_holds_them_and_a_full_queue_refuses() {
     let mut desk = desk();
     let command = |n: u128| Command {
