@@ -26,6 +26,8 @@ pub(crate) struct Felt {
     pub(crate) gap_raw: f64,
     /// The same without the machine's stalls.
     pub(crate) gap: f64,
+    /// When that pause began and ended, in ns since 1970.
+    pub(crate) worst_ns: (u64, u64),
 }
 
 /// What the actuator of `point` felt between the two times, in ns since 1970.
@@ -50,7 +52,10 @@ pub(crate) fn felt(
         let own_ns = gap.ns().saturating_sub(stalled_ns).max(gap.ns().min(period_ns));
         let periods = |ns: u64| ns as f64 / period_ns as f64;
         felt.gap_raw = felt.gap_raw.max(periods(gap.ns()));
-        felt.gap = felt.gap.max(periods(own_ns));
+        if periods(own_ns) > felt.gap {
+            felt.gap = periods(own_ns);
+            felt.worst_ns = (gap.from_ns, gap.to_ns);
+        }
         felt.lost_raw += gap.cycles_missing;
         if stalled_ns < gap.cycles_missing * (period_ns / 2) {
             felt.lost += gap.cycles_missing;
@@ -66,7 +71,10 @@ impl Felt {
         self.lost_raw += other.lost_raw;
         self.lost += other.lost;
         self.gap_raw = self.gap_raw.max(other.gap_raw);
-        self.gap = self.gap.max(other.gap);
+        if other.gap > self.gap {
+            self.gap = other.gap;
+            self.worst_ns = other.worst_ns;
+        }
     }
 
     /// Tells the figures under `name`, each with what the machine's stalls do not explain first, and judges those.
@@ -137,7 +145,8 @@ mod tests {
                 lost_raw: 1,
                 lost: 1,
                 gap_raw: 2.0,
-                gap: 2.0
+                gap: 2.0,
+                worst_ns: (200, 400)
             }
         );
         let short = Stalls::of_times(&[(300, 340)]);
@@ -156,7 +165,8 @@ mod tests {
                 lost_raw: 1,
                 lost: 0,
                 gap_raw: 2.0,
-                gap: 1.0
+                gap: 1.0,
+                worst_ns: (100, 200)
             }
         );
         assert_eq!(felt(&journal, "p", 100, (580, 1000), &quiet).gap_raw, 0.3);

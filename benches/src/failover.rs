@@ -8,7 +8,7 @@ use crate::{
     actuator::{self, felt},
     error::Error,
     faults::{Faults, LOOPS},
-    history::iae,
+    history::{Tally, iae},
     report::{Bound, Report},
     stall::Watch,
 };
@@ -44,6 +44,11 @@ pub(crate) fn run(options: Options, report: &mut Report) -> Result<(), Error> {
     let watch = Watch::start();
     let kills = options.count(50, 6);
     let pauses = options.count(20, 2);
+    let tallies = |faults: &Faults| -> Result<Vec<Tally>, Error> {
+        let api = faults.cell.plant.api();
+        faults.names.iter().map(|name| Tally::ask(&api, name)).collect()
+    };
+    let before = tallies(&faults)?;
     let mut parts = Vec::new();
     type Fault = fn(&mut Faults) -> Result<(), Error>;
     let plan: [(&str, u64, Fault); 3] = [
@@ -95,8 +100,12 @@ pub(crate) fn run(options: Options, report: &mut Report) -> Result<(), Error> {
             if part.faults > 0 {
                 report.told(&format!("{prefix}.faults"), part.faults as f64, "faults");
             }
-            felt(&journal, of.point, of.period_ns, (part.from_ns, part.to_ns), &stalls)
-                .tell(report, &prefix, lost, gap);
+            let felt = felt(&journal, of.point, of.period_ns, (part.from_ns, part.to_ns), &stalls);
+            report.progress(&format!(
+                "{prefix}: around the longest pause: {}",
+                faults.history.around(name, felt.worst_ns)
+            ));
+            felt.tell(report, &prefix, lost, gap);
             let records = faults.history.between(name, part.from_ns, part.to_ns);
             let count = |is: fn(&crate::history::Seen) -> bool| records.iter().filter(|r| is(r)).count() as f64;
             report.told(&format!("{prefix}.cycles_hedged"), count(|r| r.hedged), "cycles");
@@ -111,6 +120,9 @@ pub(crate) fn run(options: Options, report: &mut Report) -> Result<(), Error> {
                 report.told(&format!("{prefix}.iae_change"), change, "%");
             }
         }
+    }
+    for ((of, before), after) in LOOPS.iter().zip(before).zip(tallies(&faults)?) {
+        after.tell_since(before, report, &format!("failover.whole_{}", of.label));
     }
     actuator::tell_writers(report, "failover", &journal);
     report.told("failover.setpoints_missed", setpoints_missed as f64, "commands");

@@ -16,7 +16,7 @@ use bumpless_tests::{Api, Feed};
 use parking_lot::Mutex;
 use serde_json::Value;
 
-use crate::error::Error;
+use crate::{error::Error, report::Report};
 
 /// Longest wait for anything that a cell has to do.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
@@ -153,6 +153,27 @@ impl History {
         seen.iter().filter(wanted).cloned().collect()
     }
 
+    /// In words, for people: the records of a loop around a pause, so that its cause can be found.
+    pub(crate) fn around(&self, loop_name: &str, (from_ns, to_ns): (u64, u64)) -> String {
+        let margin_ns = 20_000_000;
+        let records = self.between(loop_name, from_ns.saturating_sub(margin_ns), to_ns + margin_ns);
+        let words = records.iter().map(|record| {
+            let flags = [
+                (record.took_over, ", took over"),
+                (record.hedged, ", hedged"),
+                (record.bump_percent.is_some(), ", revised"),
+                (record.rolled_back, ", rolled back"),
+            ];
+            let flags: String = flags.iter().filter(|(is, _)| *is).map(|(_, text)| *text).collect();
+            let at_ms = (record.at_ns as f64 - from_ns as f64) / 1e6;
+            format!(
+                "{at_ms:+.1} ms: cycle {} by {} for {}{flags}",
+                record.seq, record.stepped_by, record.owner
+            )
+        });
+        words.collect::<Vec<_>>().join("; ")
+    }
+
     /// Records that the feed was too slow for. The journal misses none of them.
     pub(crate) fn lost(&self) -> u64 {
         self.shared.lost.load(Ordering::Relaxed)
@@ -187,6 +208,50 @@ fn read(feed: &Feed, shared: &Shared) {
         }
     }
     shared.ended.store(true, Ordering::Relaxed);
+}
+
+/// What the home counted of a loop so far.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub(crate) struct Tally {
+    /// Cycles that began and ended without a commit.
+    pub(crate) lost: u64,
+    /// Cycles that the home itself came too late for.
+    pub(crate) skipped: u64,
+    /// Changes of ownership after a silence.
+    pub(crate) takeovers: u64,
+}
+
+impl Tally {
+    /// Asks the home, or a host that knows it.
+    pub(crate) fn ask(api: &Api, loop_name: &str) -> Result<Self, Error> {
+        let view = api.loop_view(loop_name)?;
+        let count = |key: &str| view["tally"][key].as_u64().unwrap_or(0);
+        Ok(Self {
+            lost: count("lost"),
+            skipped: count("skipped"),
+            takeovers: count("takeovers"),
+        })
+    }
+
+    /// Both together.
+    pub(crate) const fn and(self, other: Self) -> Self {
+        Self {
+            lost: self.lost + other.lost,
+            skipped: self.skipped + other.skipped,
+            takeovers: self.takeovers + other.takeovers,
+        }
+    }
+
+    /// Tells what was counted since `before`, as it was counted: the machine's stalls are in it.
+    pub(crate) fn tell_since(self, before: Self, report: &mut Report, name: &str) {
+        for (key, now, then) in [
+            ("cycles_without_commit", self.lost, before.lost),
+            ("cycles_home_too_late", self.skipped, before.skipped),
+            ("takeovers_counted", self.takeovers, before.takeovers),
+        ] {
+            report.told(&format!("{name}.home.{key}"), now.saturating_sub(then) as f64, "cycles");
+        }
+    }
 }
 
 /// Integral of the absolute error, in unit·s, of records in order.

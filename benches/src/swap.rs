@@ -24,7 +24,7 @@ use crate::{
     Options,
     actuator::{self, felt},
     error::Error,
-    history::{History, Seen},
+    history::{History, Seen, Tally},
     report::{Bound, Report},
     stall::{Stalls, Watch},
 };
@@ -55,6 +55,8 @@ const COMPONENTS: [&str; 2] = ["pid", "pidplus"];
 /// A round of swaps.
 struct Round {
     compiling: bool,
+    before: Tally,
+    after: Tally,
     from_ns: u64,
     to_ns: u64,
 }
@@ -171,6 +173,7 @@ pub(crate) fn run(options: Options, report: &mut Report) -> Result<(), Error> {
         let running = compiling
             .then(|| Uploads::start(uploader.clone(), pid.clone(), uploads))
             .transpose()?;
+        let before = Tally::ask(&api, LOOP)?;
         let from_ns = clock.now_ns();
         for swap in number * (swaps / rounds)..(number + 1) * (swaps / rounds) {
             let setpoint = if swap % 2 == 0 { 60.0 } else { 40.0 };
@@ -180,8 +183,11 @@ pub(crate) fn run(options: Options, report: &mut Report) -> Result<(), Error> {
             api.swap(LOOP, to)?;
             std::thread::sleep(AFTERWARDS);
         }
+        let after = Tally::ask(&api, LOOP)?;
         done.push(Round {
             compiling,
+            before,
+            after,
             from_ns,
             to_ns: clock.now_ns(),
         });
@@ -197,7 +203,7 @@ pub(crate) fn run(options: Options, report: &mut Report) -> Result<(), Error> {
     let pidplus = std::fs::read(&pidplus).map_err(Error::io(format!("{} cannot be read", pidplus.display())))?;
     let pidplus = Digest::of(&pidplus).to_string();
     tell_switches(report, &journal, &switches_of(&history, &done), &pidplus, swaps);
-    tell_rounds(report, &journal, &done, &stalls);
+    tell_rounds(report, &journal, &history, &done, &stalls);
     report.figure("swap.uploads", uploads as f64, "components", Bound::AtLeast(1.0));
     actuator::tell_writers(report, "swap", &journal);
     stalls.tell(report, "swap");
@@ -260,7 +266,7 @@ fn step_beyond(outputs: &[(u64, f64)], seq: u64) -> Option<f64> {
 }
 
 /// Lost cycles and pauses, with and without compiling.
-fn tell_rounds(report: &mut Report, journal: &Journal, rounds: &[Round], stalls: &Stalls) {
+fn tell_rounds(report: &mut Report, journal: &Journal, history: &History, rounds: &[Round], stalls: &Stalls) {
     for (compiling, name) in [(false, "swap.swapping"), (true, "swap.compiling")] {
         let (mut all, mut others) = (actuator::Felt::default(), actuator::Felt::default());
         for round in rounds.iter().filter(|round| round.compiling == compiling) {
@@ -276,7 +282,16 @@ fn tell_rounds(report: &mut Report, journal: &Journal, rounds: &[Round], stalls:
                 ));
             }
         }
+        report.progress(&format!(
+            "{name}: around the longest pause: {}",
+            history.around(LOOP, all.worst_ns)
+        ));
         all.tell(report, name, Bound::AtMost(0.0), Bound::Below(1.5));
+        let sum = |pick: fn(&Round) -> Tally| {
+            let of_kind = rounds.iter().filter(|round| round.compiling == compiling);
+            of_kind.map(pick).fold(Tally::default(), Tally::and)
+        };
+        sum(|r| r.after).tell_since(sum(|r| r.before), report, name);
         others.tell(report, &format!("{name}.others"), Bound::None, Bound::None);
     }
 }
