@@ -11,6 +11,7 @@ use std::{
     time::Duration,
 };
 
+use rustix::process::setpriority_process;
 use serde::{Deserialize, Serialize};
 use tokio::signal::unix::{SignalKind, signal};
 use tracing_subscriber::EnvFilter;
@@ -26,7 +27,8 @@ use crate::{
 /// Log lines where BUMPLESS_LOG says nothing: ours from info up, the bus's only when something is wrong.
 const LOG_DEFAULT: &str = "info,zenoh=warn,zenoh_transport=error,zenoh_link_commons=error";
 /// The cycle's path crosses the bus's threads as well as the loops' own, so the whole process goes before what else the
-/// machine does; what compiles goes behind it by itself.
+/// machine does; what compiles goes behind it by itself. Only once it is ready: a host that starts is work like any other,
+/// and must not hold up those that run.
 const NICE: i32 = -10;
 /// Tasks of the runtime get this long to end once everything is stopped.
 const RUNTIME_STOP_TIME_MAX: Duration = Duration::from_secs(2);
@@ -63,10 +65,6 @@ pub(crate) fn run(args: &HostArgs) -> Result<(), Error> {
         ));
     }
     log(args.log_format);
-    // Before any thread is made, so that all inherit it. A process without the right to it runs as it is.
-    if let Err(error) = rustix::process::setpriority_process(None, NICE) {
-        tracing::info!(%error, "the host runs at the usual priority; CAP_SYS_NICE would put its cycles before other work");
-    }
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
         .thread_name("async")
@@ -99,6 +97,7 @@ async fn live(config: Config, until_stdin_closes: bool) -> Result<(), Error> {
 
     let host = config.host.clone();
     let mut running = compose::run(config).await?;
+    raise_priority();
     let ready = Ready {
         ready: true,
         host: host.to_string(),
@@ -116,6 +115,22 @@ async fn live(config: Config, until_stdin_closes: bool) -> Result<(), Error> {
     running.stop().await;
     tracing::info!("stopped");
     end
+}
+
+/// Puts every thread that there is before other work; those that come later inherit it. A process without the right to it
+/// runs as it is.
+fn raise_priority() {
+    let raised = std::fs::read_dir("/proc/self/task").and_then(|tasks| {
+        for task in tasks {
+            let name = task?.file_name();
+            let id = name.to_str().and_then(|text| text.parse().ok()).and_then(rustix::process::Pid::from_raw);
+            setpriority_process(id, NICE)?;
+        }
+        Ok(())
+    });
+    if let Err(error) = raised {
+        tracing::info!(%error, "the host runs at the usual priority; CAP_SYS_NICE would put its cycles before other work");
+    }
 }
 
 /// Ends when the standard input does. A thread waits, for the standard input cannot be waited for otherwise.
