@@ -123,7 +123,10 @@ fn raise_priority() {
     let raised = std::fs::read_dir("/proc/self/task").and_then(|tasks| {
         for task in tasks {
             let name = task?.file_name();
-            let id = name.to_str().and_then(|text| text.parse().ok()).and_then(rustix::process::Pid::from_raw);
+            let id = name
+                .to_str()
+                .and_then(|text| text.parse().ok())
+                .and_then(rustix::process::Pid::from_raw);
             setpriority_process(id, NICE)?;
         }
         Ok(())
