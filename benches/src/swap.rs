@@ -25,6 +25,7 @@ use crate::{
     actuator::{self, felt},
     error::Error,
     history::{History, Seen, Tally},
+    law,
     report::{Bound, Report},
     stall::{Stalls, Watch},
 };
@@ -142,8 +143,12 @@ pub(crate) fn run(options: Options, report: &mut Report) -> Result<(), Error> {
     let cell = Cell::start(CellOptions::first_order(&fopdt))?;
     let api = cell.plant.api();
     api.upload_stock(&COMPONENTS)?;
-    let pid = bumpless_tests::components()?.join("pid.wasm");
-    let pid = std::fs::read(&pid).map_err(Error::io(format!("{} cannot be read", pid.display())))?;
+    let read = |name: &str| -> Result<Vec<u8>, Error> {
+        let path = law::component_path(name)?;
+        std::fs::read(&path).map_err(Error::io(format!("{} cannot be read", path.display())))
+    };
+    let (pid, pidplus) = (read(COMPONENTS[0])?, read(COMPONENTS[1])?);
+    let (pid_digest, pidplus) = (Digest::of(&pid).to_string(), Digest::of(&pidplus).to_string());
     api.apply(&draft(LOOP, 0, PERIOD_NS))?;
     for number in 1..=OTHERS {
         api.apply(&draft(&format!("other-{number}"), number, OTHERS_PERIOD_NS))?;
@@ -179,8 +184,8 @@ pub(crate) fn run(options: Options, report: &mut Report) -> Result<(), Error> {
             let setpoint = if swap % 2 == 0 { 60.0 } else { 40.0 };
             api.setpoint(LOOP, setpoint)?;
             std::thread::sleep(MID_WAY);
-            let to = COMPONENTS.get(usize::from(swap % 2 == 0)).copied().unwrap_or_default();
-            api.swap(LOOP, to)?;
+            // By digest: the name alone means the newest version, and that may be one that was uploaded just now.
+            api.swap(LOOP, if swap % 2 == 0 { &pidplus } else { &pid_digest })?;
             std::thread::sleep(AFTERWARDS);
         }
         let after = Tally::ask(&api, LOOP)?;
@@ -199,9 +204,6 @@ pub(crate) fn run(options: Options, report: &mut Report) -> Result<(), Error> {
     std::thread::sleep(Duration::from_millis(500));
     let stalls = watch.finish();
     let journal = cell.journal()?;
-    let pidplus = bumpless_tests::components()?.join("pidplus.wasm");
-    let pidplus = std::fs::read(&pidplus).map_err(Error::io(format!("{} cannot be read", pidplus.display())))?;
-    let pidplus = Digest::of(&pidplus).to_string();
     tell_switches(report, &journal, &switches_of(&history, &done), &pidplus, swaps);
     tell_rounds(report, &journal, &history, &done, &stalls);
     report.figure("swap.uploads", uploads as f64, "components", Bound::AtLeast(1.0));
