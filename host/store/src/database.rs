@@ -27,14 +27,30 @@ use redb::{
 
 use crate::error::Error;
 
-/// Bytes of the database that are kept in memory. The rows of a thousand loops are about that.
-const CACHE_BYTES: usize = 64 * 1024 * 1024;
-
 /// Facts about the file itself, by name.
 const FACTS: TableDefinition<&str, u64> = TableDefinition::new("facts");
 
 /// The fact that holds the format.
 const FORMAT_FACT: &str = "format";
+
+/// What a database is for decides how it is opened and written.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Use {
+    /// Bytes of it that are kept in memory.
+    pub(crate) cache_bytes: usize,
+    /// Read all of it when it is opened, so that a damaged file is an error then and not a panic later. Takes as long as the
+    /// file is large.
+    pub(crate) check_all: bool,
+    /// Write with each commit what makes opening after a crash quick, whatever the size.
+    pub(crate) quick_repair: bool,
+}
+
+/// Small, and everything depends on it. 64 MiB are about the rows of a thousand loops.
+pub(crate) const HOST: Use = Use {
+    cache_bytes: 64 * 1024 * 1024,
+    check_all: true,
+    quick_repair: false,
+};
 
 /// How a file becomes a database. Tests put a failing disk between the two.
 pub(crate) type Opener = Box<dyn Fn(&Builder, File) -> Result<Database, DatabaseError> + Send + Sync>;
@@ -49,6 +65,7 @@ pub(crate) enum Change<T> {
 
 pub(crate) struct Base {
     path: PathBuf,
+    usage: Use,
     opener: Opener,
     /// None only while it is being opened again, and after that failed.
     database: RwLock<Option<Database>>,
@@ -58,13 +75,14 @@ pub(crate) struct Base {
 impl Base {
     /// Opens or creates the database `path`. A new one gets `format`; one with a newer format is refused.
     /// The caller holds the lock of the directory.
-    pub(crate) fn open(path: &Path, format: u64, opener: Opener) -> Result<Self, Error> {
+    pub(crate) fn open(path: &Path, format: u64, usage: Use, opener: Opener) -> Result<Self, Error> {
         if !path.exists() {
-            create(path, format, &opener)?;
+            create(path, format, usage, &opener)?;
         }
-        let database = open_file(path, &opener)?;
+        let database = open_file(path, usage, &opener)?;
         let base = Self {
             path: path.to_owned(),
+            usage,
             opener,
             database: RwLock::new(Some(database)),
             broken: AtomicBool::new(false),
@@ -111,6 +129,7 @@ impl Base {
         self.with(doing, |database| {
             let mut txn = database.begin_write()?;
             txn.set_durability(durability)?;
+            txn.set_quick_repair(self.usage.quick_repair);
             match work(&txn)? {
                 Change::Keep(value) => {
                     txn.commit()?;
@@ -160,7 +179,7 @@ impl Base {
         }
         // The old one must be gone first: it holds the file's lock.
         *slot = None;
-        *slot = Some(open_file(&self.path, &self.opener)?);
+        *slot = Some(open_file(&self.path, self.usage, &self.opener)?);
         self.broken.store(false, Ordering::Release);
         tracing::info!(path = %self.path.display(), "the database was opened again after a failure");
         Ok(())
@@ -174,7 +193,7 @@ impl std::fmt::Debug for Base {
 }
 
 /// Makes the file under another name first: a process that dies in the middle leaves no half database behind.
-fn create(path: &Path, format: u64, opener: &Opener) -> Result<(), Error> {
+fn create(path: &Path, format: u64, usage: Use, opener: &Opener) -> Result<(), Error> {
     let draft = path.with_extension("new");
     match std::fs::remove_file(&draft) {
         Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
@@ -182,7 +201,7 @@ fn create(path: &Path, format: u64, opener: &Opener) -> Result<(), Error> {
         }
         _ => {}
     }
-    let database = open_file(&draft, opener)?;
+    let database = open_file(&draft, usage, opener)?;
     let fill = || -> Result<(), redb::Error> {
         let txn = database.begin_write()?;
         txn.open_table(FACTS)?.insert(FORMAT_FACT, format)?;
@@ -196,7 +215,7 @@ fn create(path: &Path, format: u64, opener: &Opener) -> Result<(), Error> {
     crate::store::rename_durably(&draft, path)
 }
 
-fn open_file(path: &Path, opener: &Opener) -> Result<Database, Error> {
+fn open_file(path: &Path, usage: Use, opener: &Opener) -> Result<Database, Error> {
     let file = OpenOptions::new()
         .read(true)
         .write(true)
@@ -206,8 +225,9 @@ fn open_file(path: &Path, opener: &Opener) -> Result<Database, Error> {
         .open(path)
         .map_err(|error| Error::io("open", path, error))?;
     let mut builder = Builder::new();
-    // The file is small, and a damaged one shall be an error here, not a panic later.
-    builder.set_cache_size(CACHE_BYTES).set_check_integrity_on_open(true);
+    builder
+        .set_cache_size(usage.cache_bytes)
+        .set_check_integrity_on_open(usage.check_all);
     opener(&builder, file).map_err(|error| match error {
         // redb says so of a file that is not its own.
         DatabaseError::Storage(redb::StorageError::Io(error)) if error.kind() == std::io::ErrorKind::InvalidData => {

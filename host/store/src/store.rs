@@ -17,7 +17,7 @@ use std::{
 use redb::backends::FileBackend;
 
 use crate::{
-    database::{Base, Opener},
+    database::{Base, HOST, Opener},
     error::Error,
     format::RowError,
 };
@@ -68,7 +68,7 @@ impl Store {
             private_dir(&folder)?;
             remove_drafts(&folder)?;
         }
-        let base = Base::open(&dir.join(DATABASE_FILE), FORMAT, opener)?;
+        let base = Base::open(&dir.join(DATABASE_FILE), FORMAT, HOST, opener)?;
         let inner = Inner {
             base,
             directory: dir.to_owned(),

@@ -2,9 +2,10 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "tests")]
 
+mod cycles;
 mod failing_disk;
 mod files;
 mod killed;
 mod rows;
-mod samples;
+pub(crate) mod samples;
 mod writer;
