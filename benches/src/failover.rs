@@ -4,7 +4,7 @@
 //! error, which is held against an undisturbed part of equal length and setpoint profile of the same run.
 
 use crate::{
-    Options,
+    FaultKind, Options,
     actuator::{self, felt},
     error::Error,
     faults::{Faults, LOOPS},
@@ -38,7 +38,7 @@ impl Part {
 }
 
 /// Runs the bench.
-pub(crate) fn run(options: Options, report: &mut Report) -> Result<(), Error> {
+pub(crate) fn run(options: Options, only: Option<FaultKind>, report: &mut Report) -> Result<(), Error> {
     report.progress("a plant and three controllers, in four processes");
     let mut faults = Faults::start()?;
     let watch = Watch::start();
@@ -51,12 +51,13 @@ pub(crate) fn run(options: Options, report: &mut Report) -> Result<(), Error> {
     let before = tallies(&faults)?;
     let mut parts = Vec::new();
     type Fault = fn(&mut Faults) -> Result<(), Error>;
-    let plan: [(&str, u64, Fault); 3] = [
-        ("replica", kills, Faults::kill_replica),
-        ("pause", pauses, Faults::pause_replica),
-        ("owner", kills, Faults::kill_owner),
+    let plan: [(FaultKind, &str, u64, Fault); 3] = [
+        (FaultKind::Replica, "replica", kills, Faults::kill_replica),
+        (FaultKind::Pause, "pause", pauses, Faults::pause_replica),
+        (FaultKind::Owner, "owner", kills, Faults::kill_owner),
     ];
-    for (name, count, fault) in plan {
+    let wanted = |kind| only.is_none_or(|only| only == kind);
+    for (_, name, count, fault) in plan.into_iter().filter(|(kind, ..)| wanted(*kind)) {
         report.progress(&format!("{name}: {count} faults"));
         let from_ns = faults.wait_period();
         for _ in 0..count {

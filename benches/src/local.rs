@@ -22,7 +22,7 @@ use bumpless_io::{
 use bumpless_loops::{Config, HeldRevision, HomeRevision, Loops, LoopsEvent, Wire};
 use parking_lot::Mutex;
 
-use crate::{Options, error::Error, law, report::Report, spread::Spread};
+use crate::{Options, error::Error, law, report::Report, spread::Spread, stall};
 
 /// A bus to nobody: a host that is alone has nobody to send to.
 struct Alone;
@@ -167,6 +167,7 @@ fn one(report: &mut Report, engine: &Engine, setting: &Setting, time: Duration) 
         )?;
         loops.set_members(&spec.id, vec![here.clone()])?;
     }
+    stall::as_a_host();
     // The first cycles touch memory for the first time; they are not the steady state.
     std::thread::sleep(Duration::from_millis(500));
     let before = counts(&loops, &ids);
@@ -232,6 +233,7 @@ fn spec(number: u32, period_ns: u64, digest: bumpless_core::Digest) -> Result<Lo
             },
         )]),
         listens: Vec::new(),
+        fallback: None,
         policy: Policy::default(),
     })
 }

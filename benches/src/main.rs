@@ -26,7 +26,7 @@ mod swap;
 
 use std::process::ExitCode;
 
-use clap::{Args, Parser, Subcommand};
+use clap::{Args, Parser, Subcommand, ValueEnum};
 
 use crate::{conditions::Conditions, error::Error, report::Report};
 
@@ -43,7 +43,11 @@ struct CommandLine {
 #[derive(Subcommand)]
 enum Bench {
     /// Kills and pauses of replicas and owners: lost cycles, pauses, double writes, integral of the absolute error.
-    Failover,
+    Failover {
+        /// Only this kind of fault.
+        #[arg(long, value_enum)]
+        only: Option<FaultKind>,
+    },
     /// A remote step over loopback TCP between processes, on the bus and through the REST API.
     Call,
     /// How soon strategies leave a replica that is loaded or far away, and come back.
@@ -64,6 +68,17 @@ enum Bench {
         /// The core to load.
         core: usize,
     },
+}
+
+/// A kind of fault.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum FaultKind {
+    /// `kill -9` of a replica.
+    Replica,
+    /// SIGSTOP of a replica, for 5 s.
+    Pause,
+    /// `kill -9` of the owner.
+    Owner,
 }
 
 /// How a bench is run.
@@ -100,21 +115,18 @@ fn main() -> ExitCode {
 fn run(bench: &Bench, options: Options) -> Result<bool, Error> {
     let name = match bench {
         Bench::Call => "call",
-        Bench::Failover => "failover",
+        Bench::Failover { .. } => "failover",
         Bench::Select => "select",
         Bench::Swap => "swap",
         Bench::Step => "step",
         Bench::Burn { core } => return stress::burn(*core).map(|()| true),
         Bench::CallPeer { component } => return peer::run(component).map(|()| true),
     };
-    if matches!(bench, Bench::Call | Bench::Step) {
-        stall::as_a_host();
-    }
     let conditions = Conditions::now(name, options.quick);
     let mut report = Report::begin(&conditions, options.json);
     match bench {
         Bench::Call => call::run(options, &mut report)?,
-        Bench::Failover => failover::run(options, &mut report)?,
+        Bench::Failover { only } => failover::run(options, *only, &mut report)?,
         Bench::Select => select::run(options, &mut report)?,
         Bench::Swap => swap::run(options, &mut report)?,
         Bench::Step => step::run(options, &mut report)?,

@@ -71,12 +71,12 @@ pub(crate) async fn join(
     )?;
     // Set once.
     let _ = loops.set(started.clone());
+    crate::stall::as_a_host();
     Ok((session, started))
 }
 
 /// Runs the peer until its standard input ends.
 pub(crate) fn run(component: &Path) -> Result<(), Error> {
-    crate::stall::as_a_host();
     let bytes = std::fs::read(component).map_err(Error::io(format!("{} cannot be read", component.display())))?;
     let engine = Engine::new(bumpless_engine::Config::default())
         .and_then(|engine| engine.prepare(&bytes).map(|_| engine))

@@ -1,7 +1,7 @@
 //! What the machine itself stalled: one bare thread per core that only sleeps to absolute deadlines.
 //!
-//! Owns: the threads, and the list of times at which they woke more than 1 ms late. They run beside a bench, with the same
-//! priority as the hosts' own threads, so what holds them up holds any thread up: another machine on the same hardware,
+//! Owns: the threads, and the list of times at which they woke more than 1 ms late. They run beside a bench, in the same
+//! class as the threads of the hosts' cycles, so what holds them up holds any thread up: another machine on the same hardware,
 //! another program. Never: makes a gap or a lost cycle disappear; it says how much of it the machine took.
 //!
 //! Times are ns since 1970 on a steady clock, as in an I/O host's journal.
@@ -14,6 +14,7 @@ use std::{
     thread::JoinHandle,
 };
 
+use bumpless_app::realtime::{self, Realtime};
 use bumpless_io::Clock;
 use rustix::{
     thread::{ClockId as SleepClock, CpuSet, clock_nanosleep_absolute, sched_getaffinity, sched_setaffinity},
@@ -26,8 +27,6 @@ use crate::{report::Report, spread::Spread};
 const PERIOD_NS: u64 = 1_000_000;
 /// A wake-up later than this is a stall, in ns.
 const STALL_NS_MIN: u64 = 1_000_000;
-/// Priority of the threads: that of a host, so that they are held up where a host's threads are.
-const NICE: i32 = -10;
 /// Stalls kept per core. A machine that stalls more often than this is no machine to measure on.
 const STALLS_MAX: usize = 1_000_000;
 
@@ -137,10 +136,10 @@ impl Watch {
     }
 }
 
-/// Gives this thread, and those that it makes, a host's priority: for benches that are a host themselves.
+/// Puts the threads that there are where a host's are: for benches that are a host themselves, once their rooms run.
 pub(crate) fn as_a_host() {
-    // Refusals only cost precision; a host that may not raise its priority runs at the usual one too.
-    let _ = rustix::process::setpriority_process(None, NICE);
+    // Refusals only cost precision, and a wish that may be refused is no error.
+    drop(realtime::raise(Realtime::Auto));
 }
 
 fn monotonic_ns() -> u64 {
@@ -160,8 +159,8 @@ fn timespec(ns: u64) -> Timespec {
 fn watch(core: usize, clock: Clock, stop: &AtomicBool) -> (Vec<Stall>, Spread) {
     let mut only = CpuSet::new();
     only.set(core);
-    as_a_host();
-    // Refusals only cost precision.
+    // Refusals only cost precision; a host that may not raise its threads runs at the usual priority too.
+    let _ = realtime::raise_this_thread();
     let _ = sched_setaffinity(None, &only);
     let _ = rustix::thread::set_current_timer_slack(std::num::NonZeroU64::new(1));
     let (mut stalls, mut lateness) = (Vec::new(), Spread::new());

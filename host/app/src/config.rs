@@ -3,6 +3,7 @@
 //! ```toml
 //! host = "a"                       # this host's name, unique in the cell
 //! data = "data"                    # components, last records, keys; beside this file
+//! realtime = "auto"                # or "required", "off": the cycle's threads go before other work
 //!
 //! [cell]
 //! name = "demo"
@@ -28,7 +29,7 @@ use bumpless_core::{CellName, HostId};
 use bumpless_io::BusConfig;
 use serde::{Deserialize, Serialize};
 
-use crate::error::Error;
+use crate::{error::Error, realtime::Realtime};
 
 /// Bytes of a configuration file: thousands of points fit; a mistaken path to a large file does not.
 const FILE_BYTES_MAX: u64 = 16 * 1024 * 1024;
@@ -42,6 +43,8 @@ pub struct Config {
     pub host: HostId,
     /// Folder of everything that outlives the process.
     pub data: PathBuf,
+    /// May the cycle's threads go before other work of the machine?
+    pub realtime: Realtime,
     /// The bus between hosts.
     pub cell: bumpless_cell::Config,
     /// Where the API listens.
@@ -65,6 +68,8 @@ pub(crate) struct File {
     host: HostId,
     #[serde(default = "data_default")]
     data: PathBuf,
+    #[serde(default)]
+    realtime: Realtime,
     cell: CellTable,
     #[serde(default)]
     api: ApiTable,
@@ -252,6 +257,7 @@ impl File {
             path: path.to_owned(),
             host: self.host,
             data: folder.join(self.data),
+            realtime: self.realtime,
             cell,
             api_listen: self.api.listen,
             io,

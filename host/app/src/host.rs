@@ -11,7 +11,6 @@ use std::{
     time::Duration,
 };
 
-use rustix::process::setpriority_process;
 use serde::{Deserialize, Serialize};
 use tokio::signal::unix::{SignalKind, signal};
 use tracing_subscriber::EnvFilter;
@@ -21,15 +20,11 @@ use crate::{
     compose,
     config::Config,
     error::Error,
-    show,
+    realtime, show,
 };
 
 /// Log lines where BUMPLESS_LOG says nothing: ours from info up, the bus's only when something is wrong.
 const LOG_DEFAULT: &str = "info,zenoh=warn,zenoh_transport=error,zenoh_link_commons=error";
-/// The cycle's path crosses the bus's threads as well as the loops' own, so the whole process goes before what else the
-/// machine does; what compiles goes behind it by itself. Only once it is ready: a host that starts is work like any other,
-/// and must not hold up those that run.
-const NICE: i32 = -10;
 /// Tasks of the runtime get this long to end once everything is stopped.
 const RUNTIME_STOP_TIME_MAX: Duration = Duration::from_secs(2);
 
@@ -95,9 +90,9 @@ async fn live(config: Config, until_stdin_closes: bool) -> Result<(), Error> {
     let mut interrupt = signal(SignalKind::interrupt()).map_err(|error| Error::start("the signal handler", error))?;
     let parent_gone = parent_gone(until_stdin_closes)?;
 
-    let host = config.host.clone();
+    let (host, wish) = (config.host.clone(), config.realtime);
     let mut running = compose::run(config).await?;
-    raise_priority();
+    realtime::raise(wish)?;
     let ready = Ready {
         ready: true,
         host: host.to_string(),
@@ -115,25 +110,6 @@ async fn live(config: Config, until_stdin_closes: bool) -> Result<(), Error> {
     running.stop().await;
     tracing::info!("stopped");
     end
-}
-
-/// Puts every thread that there is before other work; those that come later inherit it. A process without the right to it
-/// runs as it is.
-fn raise_priority() {
-    let raised = std::fs::read_dir("/proc/self/task").and_then(|tasks| {
-        for task in tasks {
-            let name = task?.file_name();
-            let id = name
-                .to_str()
-                .and_then(|text| text.parse().ok())
-                .and_then(rustix::process::Pid::from_raw);
-            setpriority_process(id, NICE)?;
-        }
-        Ok(())
-    });
-    if let Err(error) = raised {
-        tracing::info!(%error, "the host runs at the usual priority; CAP_SYS_NICE would put its cycles before other work");
-    }
 }
 
 /// Ends when the standard input does. A thread waits, for the standard input cannot be waited for otherwise.

@@ -9,6 +9,7 @@
 
 pub mod compose;
 pub mod config;
+pub mod realtime;
 
 mod cli;
 mod client;

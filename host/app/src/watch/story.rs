@@ -275,6 +275,13 @@ fn in_words(event: &Event, record: &Record) -> Option<String> {
             show::short(&record.digest),
             show::maybe(*bump_percent)
         ),
+        Event::OverBump {
+            bump_percent,
+            limit_percent,
+        } => format!(
+            "the output stepped by {} % of span, the loop allows {limit_percent} %",
+            show::maybe(*bump_percent)
+        ),
         Event::RolledBack { from, reason } => format!("rolled back from revision {from}: {reason}"),
         Event::BadInput { port } => format!("input {port} is bad"),
         Event::Limited { .. } => return None,
