@@ -10,20 +10,19 @@ use std::{
         atomic::{AtomicI64, AtomicU64, Ordering},
     },
     thread::JoinHandle,
-    time::Duration,
 };
 
 use bumpless_cell::{Arrival, Vitals};
 use bumpless_core::{Command, CommandId, Digest, Fault, Frame, HostId, LoopId, Record, Strategy, limits::REPLICAS_MAX};
 use bumpless_engine::{Engine, Instance};
 use bumpless_io::{Clock, IoServer};
-use crossbeam_channel::{Sender, TrySendError};
 use parking_lot::{Mutex, RwLock};
 
 use crate::{
     error::Error,
     event::{CallEnd, CallRequest, CommandReply, Event, HeldRevision, HomeRevision, LoopsEvent, Opening},
     home::HomeView,
+    inbox::{self, Sender},
     replicas::Replicas,
     shared::Shared,
     wire::Wire,
@@ -34,8 +33,6 @@ use crate::{
 const INBOX_MAX: usize = 65_536;
 /// Instances that may wait to be dropped.
 const REAPER_MAX: usize = 4096;
-/// Longest wait for a worker at the end: a step that spins is stopped by its limit long before.
-const STOP_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// How loops are run.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -100,7 +97,7 @@ impl Loops {
             .map_err(Error::Thread)?;
         let (mut inboxes, mut threads) = (Vec::new(), Vec::new());
         for index in 0..config.workers.clamp(1, 64) {
-            let (inbox, events) = crossbeam_channel::bounded(INBOX_MAX);
+            let (inbox, events) = inbox::bounded(INBOX_MAX);
             let worker = Worker::new(index, Arc::clone(&shared), events);
             let thread = std::thread::Builder::new()
                 .name(format!("loops-{index}"))
@@ -133,7 +130,7 @@ impl Loops {
         let Some(inbox) = self.inner.inboxes.get(index) else {
             return;
         };
-        if let Err(TrySendError::Full(_)) = inbox.try_send(event) {
+        if inbox.try_send(event).is_err() {
             self.inner.shared.dropped.fetch_add(1, Ordering::Relaxed);
         }
     }
@@ -354,8 +351,7 @@ impl Loops {
     /// Stops the workers and waits for them, at most two seconds. Blocks.
     pub fn stop(&self) {
         for inbox in &self.inner.inboxes {
-            // A full inbox empties within the timeout, unless its worker is stuck, which the join below reports.
-            drop(inbox.send_timeout(Event::Stop, STOP_TIMEOUT));
+            inbox.send_first(Event::Stop);
         }
         for thread in self.inner.threads.lock().drain(..) {
             let name = thread.thread().name().unwrap_or("?").to_owned();
@@ -370,7 +366,7 @@ impl Drop for Inner {
     fn drop(&mut self) {
         // The workers hold each other's inboxes, so without this they would outlive the last handle.
         for inbox in &self.inboxes {
-            drop(inbox.try_send(Event::Stop));
+            inbox.send_first(Event::Stop);
         }
     }
 }

@@ -20,6 +20,7 @@ mod error;
 mod event;
 mod handle;
 mod home;
+mod inbox;
 mod replicas;
 mod revise;
 mod seat;

@@ -8,10 +8,10 @@ use std::sync::{
 use bumpless_core::{HostId, Record};
 use bumpless_engine::{Engine, Instance};
 use bumpless_io::{Clock, IoServer};
-use crossbeam_channel::Sender;
 
 use crate::{
     event::{Event, LoopsEvent},
+    inbox::Sender,
     replicas::Replicas,
     wire::Wire,
 };
@@ -28,7 +28,7 @@ pub(crate) struct Shared {
     pub(crate) sink: Sink,
     pub(crate) replicas: Replicas,
     /// Old instances go here: to drop one unmaps memory, which is no work for a cycle's thread.
-    pub(crate) reaper: Sender<Instance>,
+    pub(crate) reaper: crossbeam_channel::Sender<Instance>,
     pub(crate) owned: AtomicI64,
     pub(crate) held: AtomicI64,
     pub(crate) dropped: AtomicU64,

@@ -11,9 +11,15 @@ use std::{
 };
 
 use bumpless_core::LoopId;
-use crossbeam_channel::{Receiver, RecvTimeoutError};
 
-use crate::{calls::Calls, event::Event, home::Home, seat::Seat, shared::Shared};
+use crate::{
+    calls::Calls,
+    event::Event,
+    home::Home,
+    inbox::{Nothing, Receiver},
+    seat::Seat,
+    shared::Shared,
+};
 
 /// Longest sleep, in ns: a worker with nothing to do looks around this often.
 const NAP_NS_MAX: u64 = 1_000_000_000;
@@ -73,9 +79,9 @@ impl Worker {
             // lies in the inbox already, and a takeover for it would be noise. Bounded, so that timers get their turn.
             for _ in 0..EVENTS_BEFORE_TIMERS_MAX {
                 match self.inbox.try_recv() {
-                    Ok(Event::Stop) => break 'run,
-                    Ok(event) => self.handle(event),
-                    Err(_) => break,
+                    Some(Event::Stop) => break 'run,
+                    Some(event) => self.handle(event),
+                    None => break,
                 }
             }
             let now_ns = self.fire();
@@ -85,9 +91,9 @@ impl Worker {
                 .map_or(now_ns + NAP_NS_MAX, |Reverse((at_ns, _))| *at_ns);
             let wait = Duration::from_nanos(next_ns.saturating_sub(now_ns).min(NAP_NS_MAX));
             match self.inbox.recv_timeout(wait) {
-                Ok(Event::Stop) | Err(RecvTimeoutError::Disconnected) => break,
+                Ok(Event::Stop) | Err(Nothing::Disconnected) => break,
                 Ok(event) => self.handle(event),
-                Err(RecvTimeoutError::Timeout) => {}
+                Err(Nothing::Timeout) => {}
             }
         }
     }
