@@ -20,7 +20,7 @@ pub use loops::{
     Policy, RollbackRequest, SetRequest, SetpointRequest, SwapRequest, Tally,
 };
 pub use record::{Alarm, Applied, Event, LogLine, Message, Reading, Record};
-pub use words::{Direction, LogLevel, Mode, OnFault, PortKind, Priority, Quality, Strategy};
+pub use words::{Direction, LogLevel, Mode, OnBump, OnFault, PortKind, Priority, Quality, Strategy};
 
 pub(crate) use loops::Depth;
 pub(crate) use record::{PortTable, PortTables};

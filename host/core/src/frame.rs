@@ -139,4 +139,7 @@ pub enum Fault {
         /// Why.
         reason: String,
     },
+    /// Good by itself, but not as a component on probation must be.
+    #[error("the component is on probation: {0}")]
+    Probation(String),
 }

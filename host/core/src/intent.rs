@@ -234,6 +234,7 @@ mod tests {
             replicas: 3,
             limits: BTreeMap::new(),
             listens: Vec::new(),
+            fallback: None,
             policy: Policy::default(),
         }
     }

@@ -10,6 +10,7 @@
 
 pub mod limits;
 
+pub mod admission;
 pub mod component;
 pub mod descriptor;
 pub mod digest;
@@ -32,7 +33,8 @@ pub mod select;
 pub mod swap;
 pub mod tick;
 
-pub use component::{ComponentInfo, ComponentInfoError};
+pub use admission::{Admission, Finding, Fit, Migrated, Severity, Verdict};
+pub use component::{ComponentEvent, ComponentInfo, ComponentInfoError, Edition};
 pub use descriptor::{Descriptor, Direction, ParameterSpec, PortKind, PortSpec};
 pub use digest::Digest;
 pub use frame::{AlarmChange, Cycle, Effects, Fault, Frame, LogLevel, LogLine, Message, Priority};
@@ -40,5 +42,5 @@ pub use intent::{Intent, IntentError};
 pub use name::{BusId, CellName, HostId, LoopId, NameError, PointId};
 pub use reading::{NoData, Quality, Reading};
 pub use record::{Applied, Command, CommandBody, CommandId, Event, Outcome, Record};
-pub use spec::{LoopSpec, Mode, OnFault, OutputLimit, Policy, SpecError, Strategy};
+pub use spec::{LoopSpec, Mode, OnBump, OnFault, OutputLimit, Policy, SpecError, Strategy};
 pub use wiring::Wiring;

@@ -90,6 +90,13 @@ pub enum Event {
         /// Output step beyond what the old controller would have done, in % of span.
         bump_percent: f64,
     },
+    /// The switch to this revision moved an output farther than the loop allows, and its policy lets that pass.
+    OverBump {
+        /// Step of the output beyond what the old controller would have done, in % of span.
+        bump_percent: f64,
+        /// What the loop allows, in % of span.
+        limit_percent: f64,
+    },
     /// A fault in probation sent the loop back to the revision before.
     RolledBack {
         /// The revision left.
@@ -134,6 +141,8 @@ pub struct Record {
     pub manual: Vec<f64>,
     /// What the step saw, one reading per port.
     pub readings: Vec<Reading>,
+    /// The messages that the step received: with readings and state it is all that the step knew, so that it can be repeated.
+    pub heard: Vec<Message>,
     /// What the controller wanted, one per output port; NaN never.
     pub wanted: Vec<f64>,
     /// What the arbiter let through, one per output port.
@@ -188,6 +197,7 @@ pub(crate) fn test_record() -> Record {
         setpoint: 1.0,
         manual: vec![0.0],
         readings: vec![],
+        heard: vec![],
         wanted: vec![0.0],
         outputs: vec![0.0],
         state: Arc::from([]),

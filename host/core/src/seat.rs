@@ -376,6 +376,7 @@ pub fn conclude(c: Conclusion<'_>) -> Record {
             Mode::Automatic => outputs.clone(),
         },
         readings,
+        heard: sample.messages.clone(),
         wanted: finite(wanted, &outputs),
         outputs,
         state: Arc::from(effects.state),

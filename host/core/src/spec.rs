@@ -128,6 +128,16 @@ pub enum OnFault {
     Manual,
 }
 
+/// What a loop does when a change would step an output farther than it allows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum OnBump {
+    /// The old revision stays.
+    Refuse,
+    /// The new one takes over, and the record says by how much.
+    Alarm,
+}
+
 /// The bounds within which the host runs the loop.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -146,8 +156,13 @@ pub struct Policy {
     pub takeover_part: f64,
     /// Greatest step of an output at a swap beyond what the old controller would have done, in % of the output's span.
     pub bump_limit_percent: f64,
+    /// What happens to a change beyond it.
+    pub on_bump: OnBump,
     /// Cycles after a swap during which a fault rolls back to the old component.
     pub probation_cycles: u32,
+    /// Greatest difference of an output, in probation, from what the old component would send in the same cycle from the
+    /// same state, in % of the output's span; more rolls back. None where the two may differ.
+    pub probation_deviation_percent: Option<f64>,
 }
 
 impl Default for Policy {
@@ -158,10 +173,13 @@ impl Default for Policy {
             on_bad_input: OnFault::Hold,
             step_limit_us: 0,
             // The owner must have tried a replica and itself before the arbiter looks elsewhere, so hedge < takeover.
-            hedge_part: 0.2,
-            takeover_part: 0.5,
+            // A takeover at 0.4 ends before half of the next period has gone, and leaves time for a second one.
+            hedge_part: 0.15,
+            takeover_part: 0.4,
             bump_limit_percent: 5.0,
+            on_bump: OnBump::Refuse,
             probation_cycles: 20,
+            probation_deviation_percent: None,
         }
     }
 }
@@ -195,6 +213,9 @@ pub struct LoopSpec {
     pub limits: BTreeMap<String, OutputLimit>,
     /// Topics whose messages the controller receives; at most 16.
     pub listens: Vec<String>,
+    /// The component that takes over, without a person, when this one has failed more often in a row than the policy
+    /// tolerates; none where the policy alone decides.
+    pub fallback: Option<Digest>,
     /// The bounds within which the host runs the loop.
     pub policy: Policy,
 }
@@ -291,6 +312,13 @@ impl LoopSpec {
         }
         if !(p.bump_limit_percent >= 0.0 && p.bump_limit_percent.is_finite()) {
             return Err(SpecError::Policy("bump_limit_percent must be 0 or more"));
+        }
+        if p.probation_deviation_percent
+            .is_some_and(|limit| !(limit > 0.0 && limit.is_finite()))
+        {
+            return Err(SpecError::Policy(
+                "probation_deviation_percent must be greater than 0, or be left out",
+            ));
         }
         if p.step_limit_us.saturating_mul(1000) > self.period_ns {
             return Err(SpecError::Policy("step_limit_us must not be longer than the period"));

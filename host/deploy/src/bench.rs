@@ -190,10 +190,13 @@ impl Room {
             infos.sort_by_key(|info| std::cmp::Reverse(info.uploaded_at_unix_ms));
             room.forget_unneeded(&infos);
             let now = Instant::now();
-            let next = infos.iter().take(PREPARED_AHEAD_MAX).find(|info| {
-                !room.bench.is_ready(&info.digest) && failed.get(&info.digest).is_none_or(|(_, again)| *again <= now)
+            // What a loop falls back to must be ready before it fails; then the newest.
+            let fallbacks = room.book.all().into_iter().filter_map(|intent| intent.current.fallback);
+            let newest = infos.iter().take(PREPARED_AHEAD_MAX).map(|info| info.digest);
+            let next = fallbacks.chain(newest).find(|digest| {
+                !room.bench.is_ready(digest) && failed.get(digest).is_none_or(|(_, again)| *again <= now)
             });
-            let Some(digest) = next.map(|info| info.digest) else {
+            let Some(digest) = next else {
                 continue;
             };
             if let Err(error) = room.prepared(digest, None).await {
@@ -219,6 +222,7 @@ impl Room {
             .collect();
         for intent in self.book.all() {
             needed.extend(wanted_revisions(&intent).into_iter().map(|spec| spec.digest));
+            needed.extend(intent.current.fallback);
         }
         let age = |digest: &Digest| {
             newest_first

@@ -247,7 +247,8 @@ impl Book {
     pub(crate) fn users_of(&self, digest: &bumpless_core::Digest) -> Vec<LoopId> {
         let pages = self.pages.read();
         let uses = |intent: &Intent| {
-            intent.current.digest == *digest
+            intent.revisions().take(2).any(|s| s.fallback == Some(*digest))
+                || intent.current.digest == *digest
                 || intent.pending.as_ref().is_some_and(|s| s.digest == *digest)
                 || intent.past.first().is_some_and(|s| s.digest == *digest)
                 || intent.previous().is_some_and(|s| s.digest == *digest)

@@ -80,8 +80,12 @@ impl Room {
         let id = plan::loop_id(&draft.name)?;
         self.in_turn(id.clone(), move |room| async move {
             let info = room.component(&draft.component, &from).await?;
+            let fallback = match &draft.fallback {
+                Some(reference) => Some(room.component(reference, &from).await?),
+                None => None,
+            };
             match room.book.get(&id) {
-                None => room.create(&draft, &info).await,
+                None => room.create(&draft, &info, fallback.as_deref()).await,
                 Some(intent) => {
                     room.is_home(&intent)?;
                     let spec = plan::spec(
@@ -90,6 +94,7 @@ impl Room {
                         &info.descriptor,
                         &room.ground(&|p| room.point_facts(p, &id)),
                     )?;
+                    room.check_fallback(&spec, &info, fallback.as_deref())?;
                     room.change(intent, spec, &info, Dropped::default()).await
                 }
             }
@@ -246,10 +251,75 @@ impl Room {
         readiness
     }
 
-    async fn create(self: &Arc<Self>, draft: &LoopDraft, info: &ComponentInfo) -> Result<ApplyEnd, Error> {
+    /// Could the fallback run the loop? Better told now than when it is needed.
+    fn check_fallback(
+        &self,
+        spec: &LoopSpec,
+        info: &ComponentInfo,
+        fallback: Option<&ComponentInfo>,
+    ) -> Result<(), Error> {
+        let Some(fallback) = fallback else { return Ok(()) };
+        let swapped = plan::fall_back(spec, fallback.digest, Some(&info.descriptor), &fallback.descriptor);
+        let facts = |point: &_| self.point_facts(point, &spec.id);
+        match plan::complete(swapped.spec, &fallback.descriptor, &self.ground(&facts)) {
+            Ok(_) => Ok(()),
+            Err(error) => {
+                let words = error.words();
+                Err(Error::invalid(
+                    format!(
+                        "{}@{} cannot be the fallback: {}",
+                        fallback.name, fallback.version, words.reason
+                    ),
+                    "choose a component that runs with this loop's ports",
+                ))
+            }
+        }
+    }
+
+    /// Goes on with the fallback, because the component in force keeps failing. Nobody asked, so nobody is told of a
+    /// failure but the log; the next failing cycles ask again.
+    pub(crate) fn fall_back(self: &Arc<Self>, failing: &Record) {
+        let (id, revision, faults) = (failing.loop_id.clone(), failing.revision, failing.faults_in_row);
+        let room = Arc::clone(self);
+        self.spawn(async move {
+            let name = id.clone();
+            let end = room.in_turn(id.clone(), move |room| async move {
+                let intent = room.book.find(&id)?;
+                let current = intent.current.clone();
+                let Some(digest) = current.fallback.filter(|_| current.revision == revision) else {
+                    return Err(Error::refused("the loop was changed meanwhile", ""));
+                };
+                let new = room.info_of(digest, None).await?;
+                let old = room.info_of(current.digest, None).await.ok();
+                let swapped = plan::fall_back(&current, digest, old.as_ref().map(|i| &i.descriptor), &new.descriptor);
+                let facts = |point: &_| room.point_facts(point, &id);
+                let spec = plan::complete(swapped.spec, &new.descriptor, &room.ground(&facts))?;
+                let dropped = Dropped {
+                    parameters: swapped.parameters,
+                    ports: swapped.ports,
+                };
+                room.change(intent, spec, &new, dropped).await
+            });
+            match end.await {
+                Ok(end) => tracing::error!(
+                    loop_id = %name, failed = revision, revision = end.revision, faults,
+                    "the loop's component kept failing; its fallback runs now"
+                ),
+                Err(error) => tracing::warn!(loop_id = %name, revision, faults, %error, "the loop cannot fall back"),
+            }
+        });
+    }
+
+    async fn create(
+        self: &Arc<Self>,
+        draft: &LoopDraft,
+        info: &ComponentInfo,
+        fallback: Option<&ComponentInfo>,
+    ) -> Result<ApplyEnd, Error> {
         let id = plan::loop_id(&draft.name)?;
         let facts = |point: &_| self.point_facts(point, &id);
         let spec = plan::spec(draft, info.digest, &info.descriptor, &self.ground(&facts))?;
+        self.check_fallback(&spec, info, fallback)?;
         if self.book.len() >= LOOPS_MAX {
             return Err(Error::busy(
                 format!("the cell has {LOOPS_MAX} loops, the most it may have"),

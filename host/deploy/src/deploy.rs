@@ -136,6 +136,9 @@ impl Deploy {
         let id = plan::loop_id(&draft.name)?;
         // By digest, for the home may not have heard of the component yet.
         draft.component = self.room.library.resolve(&draft.component)?.digest.to_string();
+        if let Some(fallback) = &mut draft.fallback {
+            *fallback = self.room.library.resolve(fallback)?.digest.to_string();
+        }
         let home = match self.room.book.get(&id) {
             Some(intent) => intent.home.clone(),
             None => self.home_for(&draft).await?,

@@ -55,6 +55,9 @@ pub struct LoopDraft {
     /// Topics whose messages the controller receives.
     #[serde(default)]
     pub listens: Vec<String>,
+    /// The component that takes over by itself when this one keeps failing; same forms as `component`.
+    #[serde(default)]
+    pub fallback: Option<String>,
     /// Fault, hedge, takeover and swap policy.
     #[serde(default)]
     pub policy: Policy,

@@ -5,7 +5,7 @@
 use std::collections::BTreeMap;
 
 use bumpless_core::{
-    Descriptor, Digest, Direction, HostId, LoopId, LoopSpec, OutputLimit, PointId, SpecError, Wiring,
+    Descriptor, Digest, Direction, HostId, LoopId, LoopSpec, OnBump, OutputLimit, PointId, SpecError, Wiring,
     limits::{PERIOD_NS_MAX, PERIOD_NS_MIN},
 };
 
@@ -86,9 +86,33 @@ pub(crate) fn spec(
         replicas: draft.replicas,
         limits: draft.limits.clone(),
         listens: draft.listens.clone(),
+        fallback: fallback_digest(draft)?,
         policy: draft.policy,
     };
     complete(spec, descriptor, ground)
+}
+
+/// The fallback in a draft that reached the loop's home: its digest by then.
+fn fallback_digest(draft: &LoopDraft) -> Result<Option<Digest>, Error> {
+    let parse = |text: &String| {
+        text.parse().map_err(|_| {
+            Error::invalid(
+                format!("fallback = {text:?} is no component's digest"),
+                "name a component of the library",
+            )
+        })
+    };
+    draft.fallback.as_ref().map(parse).transpose()
+}
+
+/// What a loop runs when its component keeps failing: the fallback with what it takes of ports and parameters. It comes in
+/// whatever the bump, it has no probation that could lead back to what failed, and no fallback itself.
+pub(crate) fn fall_back(current: &LoopSpec, digest: Digest, old: Option<&Descriptor>, new: &Descriptor) -> Swapped {
+    let mut swapped = swap(current, digest, old, new);
+    swapped.spec.fallback = None;
+    swapped.spec.policy.on_bump = OnBump::Alarm;
+    swapped.spec.policy.probation_cycles = 0;
+    swapped
 }
 
 /// Fills in what the points say, and checks everything.

@@ -324,9 +324,13 @@ impl Room {
     /// Takes what arrives. Never blocks.
     pub(crate) fn arrive(self: &Arc<Self>, arrival: DeployArrival) {
         match arrival {
-            DeployArrival::Loops(LoopsEvent::Record(record)) | DeployArrival::Bus(Arrival::Record(record)) => {
+            DeployArrival::Loops(LoopsEvent::Record(record)) => {
+                if record.faults_in_row > 0 {
+                    self.look_for_fallback(&record);
+                }
                 self.feed.pass(record);
             }
+            DeployArrival::Bus(Arrival::Record(record)) => self.feed.pass(record),
             // The record with it has passed before, or does now; the reconciliation reads it from there.
             DeployArrival::Loops(LoopsEvent::Revised { loop_id, revision }) => {
                 self.homes.revised(&loop_id, revision);
@@ -374,6 +378,19 @@ impl Room {
                 });
             }
             DeployArrival::Bus(other) => tracing::debug!(?other, "an arrival that is not for deployment"),
+        }
+    }
+
+    /// A record of a failing loop, taken at its home, which is here. Asked again when the faults have doubled.
+    fn look_for_fallback(self: &Arc<Self>, record: &bumpless_core::Record) {
+        let Some(intent) = self.book.get(&record.loop_id) else {
+            return;
+        };
+        let beyond = record
+            .faults_in_row
+            .saturating_sub(intent.current.policy.faults_tolerated);
+        if intent.current.fallback.is_some() && intent.current.revision == record.revision && beyond.is_power_of_two() {
+            self.fall_back(record);
         }
     }
 

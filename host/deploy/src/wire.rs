@@ -15,7 +15,7 @@ use crate::{
 };
 
 /// Version of these lists. Another one is refused in words, so that a half updated cell says what is the matter.
-const VERSION: u8 = 1;
+const VERSION: u8 = 2;
 
 /// A position of an intent among its copies: see [`Intent::position`].
 pub(crate) type Position = (u64, u64);
@@ -217,6 +217,7 @@ mod tests {
                 },
             )]),
             listens: vec![],
+            fallback: None,
             policy: Policy::default(),
         };
         for ask in [Ask::Apply(Box::new(draft)), Ask::Library, Ask::Points(7)] {

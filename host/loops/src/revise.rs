@@ -6,7 +6,8 @@
 use std::sync::Arc;
 
 use bumpless_core::{
-    CommandId, Effects, Event as CycleEvent, Fault, Frame, LoopId, Outcome, Reading, guard, seat::Stepped, swap,
+    CommandId, Effects, Event as CycleEvent, Fault, Frame, LoopId, Mode, OnBump, Outcome, OutputLimit, Reading, guard,
+    seat::Stepped, swap,
 };
 use bumpless_engine::Origin;
 
@@ -43,6 +44,16 @@ pub(crate) fn track(held: &HeldRevision, readings: &[Reading]) -> Vec<f64> {
         .zip(&held.wiring.limits)
         .map(|(v, l)| if v.is_finite() { *v } else { l.safe })
         .collect()
+}
+
+/// The output of another revision that drives the same point.
+fn same_output(held: &HeldRevision, output: usize, other: &HeldRevision) -> Option<usize> {
+    let point = |held: &HeldRevision, output: usize| {
+        let port = held.wiring.outputs.get(output)?;
+        held.wiring.points.get(usize::from(*port)).cloned().flatten()
+    };
+    let wanted = point(held, output)?;
+    (0..other.wiring.outputs.len()).find(|i| point(other, *i).as_ref() == Some(&wanted))
 }
 
 fn origin(held: &HeldRevision) -> Origin {
@@ -111,6 +122,68 @@ impl Worker {
         self.conclude_with(id, running, step, old, readings, None);
     }
 
+    /// In probation: why this step must not count, if so. The component before gives the measure: it steps here on the same
+    /// frame, from the same state, and what it sends is what the loop would have had. Where it has no answer there is no
+    /// measure, and the step counts.
+    pub(crate) fn on_probation(&mut self, id: &LoopId, running: &Running, stepped: &Stepped) -> Option<Fault> {
+        let (back, _) = running.base.as_ref()?.probation?;
+        let seat = self.seats.get_mut(id)?;
+        let place = |revision| seat.held.iter().position(|h| h.spec.revision == revision);
+        let (new, old) = (place(running.sample.revision)?, place(back)?);
+        let (now, policy) = (&seat.held[new], &seat.held[new].spec.policy);
+        let actuators = track(now, &running.frame.readings);
+        let wanted = now.wiring.wanted(&stepped.effects.writes, &actuators);
+        let outside = |held: &HeldRevision, wanted: &[f64], output: usize| {
+            let (value, limit) = (wanted.get(output), held.wiring.limits.get(output));
+            value.zip(limit).is_some_and(|(v, l)| !(l.low..=l.high).contains(v))
+        };
+        let compared = policy.probation_deviation_percent.is_some();
+        if running.standing.mode == Mode::Manual || !(compared || (0..wanted.len()).any(|i| outside(now, &wanted, i))) {
+            return None;
+        }
+        let limit_percent = policy.probation_deviation_percent.unwrap_or(f64::INFINITY);
+        let from = origin(now);
+        let readings = now.wiring.remap(&running.frame.readings, &seat.held[old].wiring);
+        let before = &mut seat.held[old];
+        let limit_ns = before.spec.step_limit_ns();
+        let held = track(before, &readings);
+        let (state, _) = take_over(before, Some((&from, &running.state)), &held, limit_ns).ok()?;
+        let frame = Frame {
+            readings,
+            ..running.frame.clone()
+        };
+        let effects = before.instance.step(&frame, &state, limit_ns).ok()?;
+        let before = &seat.held[old];
+        let usual = before.wiring.wanted(&effects.writes, &held);
+        let now = &seat.held[new];
+        for (i, value) in wanted.iter().enumerate() {
+            let name = || now.descriptor.ports[usize::from(now.wiring.outputs[i])].name.clone();
+            let Some(j) = same_output(now, i, before) else { continue };
+            if outside(now, &wanted, i) && !outside(before, &usual, j) {
+                let OutputLimit { low, high, .. } = now.wiring.limits[i];
+                return Some(Fault::Probation(format!(
+                    "{} = {value} is outside its limits, {low} to {high}, and the component before stays within",
+                    name()
+                )));
+            }
+            // Both as the limits let them through: beyond them no difference reaches the actuator.
+            let through = |held: &HeldRevision, value: f64, output: usize| {
+                let limit = held.wiring.limits[output];
+                value.clamp(limit.low, limit.high)
+            };
+            let apart = through(now, *value, i) - through(before, usual[j], j);
+            let percent = swap::bump_percent(&[0.0], &[apart], &[now.wiring.span(i)]);
+            if percent > limit_percent {
+                return Some(Fault::Probation(format!(
+                    "{} is {percent:.3} % of its span away from what the component before sends; the loop allows \
+                     {limit_percent} % (policy.probation_deviation_percent)",
+                    name()
+                )));
+            }
+        }
+        None
+    }
+
     /// A change of revision: both components step on the same frame here, and the bump decides.
     pub(crate) fn revise(&mut self, id: &LoopId, mut running: Running, command: CommandId, revision: u64) {
         let Some(seat) = self.seats.get_mut(id) else { return };
@@ -146,6 +219,12 @@ impl Worker {
                     by: tried.by.to_owned(),
                     bump_percent: tried.bump_percent,
                 });
+                if let Some(limit_percent) = tried.over_percent {
+                    running.events.push(CycleEvent::OverBump {
+                        bump_percent: tried.bump_percent,
+                        limit_percent,
+                    });
+                }
                 running.standing.remember(command, Outcome::Done);
                 let spec = &seat.held[tried.index].spec;
                 let probation = (spec.policy.probation_cycles > 0 && tried.by != "same")
@@ -180,6 +259,8 @@ struct Tried {
     effects: Effects,
     by: &'static str,
     bump_percent: f64,
+    /// The loop's limit, where the bump is beyond it and the policy lets it pass.
+    over_percent: Option<f64>,
 }
 
 fn spec_outputs(held: &HeldRevision) -> usize {
@@ -248,7 +329,8 @@ fn try_revision(
     let compared = if same_ports { &old_outputs } else { &actuators };
     let bump_percent = swap::bump_percent(compared, &new_outputs, &spans);
     let limit = new.spec.policy.bump_limit_percent;
-    if bump_percent > limit {
+    let over_percent = (bump_percent > limit).then_some(limit);
+    if over_percent.is_some() && new.spec.policy.on_bump == OnBump::Refuse {
         return Err(format!(
             "the output would step by {bump_percent:.3} % of its span beyond what the old controller does; \
              the loop allows {limit} % (policy.bump_limit_percent)"
@@ -261,5 +343,6 @@ fn try_revision(
         effects,
         by,
         bump_percent,
+        over_percent,
     })
 }

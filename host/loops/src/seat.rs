@@ -482,7 +482,16 @@ impl Worker {
     }
 
     /// Ends the cycle under the revision in force.
-    pub(crate) fn conclude(&mut self, id: &LoopId, running: Running, step: Result<Stepped, Fault>) {
+    pub(crate) fn conclude(&mut self, id: &LoopId, mut running: Running, step: Result<Stepped, Fault>) {
+        if let Ok(stepped) = &step
+            && let Some(fault) = self.on_probation(id, &running, stepped)
+        {
+            running.events.push(CycleEvent::Faulted {
+                replica: stepped.by.clone(),
+                fault: fault.to_string(),
+            });
+            return self.without_a_step(id, running, fault);
+        }
         let Some(seat) = self.seats.get(id) else { return };
         let Some(index) = seat
             .held

@@ -229,6 +229,7 @@ impl Bench {
             )]
             .into(),
             listens: vec![],
+            fallback: None,
             policy: Policy {
                 probation_cycles: 30,
                 ..Policy::default()

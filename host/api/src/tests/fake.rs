@@ -119,11 +119,16 @@ fn info() -> ComponentInfo {
             parameters: Vec::new(),
             state_layout: 1,
         },
+        world: bumpless_core::component::CONTROLLER_WORLD.into(),
         imports: Vec::new(),
         bytes: 3,
         uploaded_at_unix_ms: 0,
         uploaded_by: "api".into(),
         note: String::new(),
+        labels: [("stage".to_owned(), "pilot".to_owned())].into(),
+        changes: 0,
+        history: Vec::new(),
+        admission: None,
     }
 }
 
@@ -143,6 +148,7 @@ fn record(name: &str, seq: u64) -> Record {
         setpoint: 1.5,
         manual: vec![f64::NAN],
         readings: vec![Reading::good(1.25, 4_000_000), Reading::good(30.0, 0)],
+        heard: vec![],
         wanted: vec![30.0],
         outputs: vec![30.0],
         state: Arc::from([1, 2, 3]),
@@ -182,6 +188,7 @@ pub(crate) fn view(name: &str) -> LoopView {
             replicas: 3,
             limits: Default::default(),
             listens: Vec::new(),
+            fallback: None,
             policy: Policy::default(),
         },
         pending: None,

@@ -7,7 +7,7 @@ use bumpless_deploy as deploy;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-use super::{Mode, OnFault, PortTable, Record, Strategy, finite, ms};
+use super::{Mode, OnBump, OnFault, PortTable, Record, Strategy, finite, ms};
 
 const fn three() -> u8 {
     3
@@ -56,6 +56,10 @@ pub struct LoopDraft {
     /// Topics whose messages the controller receives; at most 16.
     #[serde(default)]
     pub listens: Vec<String>,
+    /// The component that takes over by itself when this one has failed more often in a row than the policy tolerates; the
+    /// same forms as `component`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub fallback: Option<String>,
     /// Fault, hedge, takeover and swap policy.
     #[serde(default)]
     pub policy: Policy,
@@ -94,8 +98,14 @@ pub struct Policy {
     pub takeover_part: f64,
     /// Greatest step of an output at a swap, in % of the output's span.
     pub bump_limit_percent: f64,
+    /// What happens to a change beyond it.
+    pub on_bump: OnBump,
     /// Cycles after a swap during which a fault rolls back.
     pub probation_cycles: u32,
+    /// In probation: greatest difference of an output from what the old component would send in the same cycle from the same
+    /// state, in % of the output's span; more rolls back. None where the two may differ.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub probation_deviation_percent: Option<f64>,
 }
 
 impl Default for Policy {
@@ -114,7 +124,9 @@ impl From<model::Policy> for Policy {
             hedge_part: policy.hedge_part,
             takeover_part: policy.takeover_part,
             bump_limit_percent: policy.bump_limit_percent,
+            on_bump: policy.on_bump.into(),
             probation_cycles: policy.probation_cycles,
+            probation_deviation_percent: policy.probation_deviation_percent,
         }
     }
 }
@@ -129,7 +141,9 @@ impl From<Policy> for model::Policy {
             hedge_part: policy.hedge_part,
             takeover_part: policy.takeover_part,
             bump_limit_percent: policy.bump_limit_percent,
+            on_bump: policy.on_bump.into(),
             probation_cycles: policy.probation_cycles,
+            probation_deviation_percent: policy.probation_deviation_percent,
         }
     }
 }
@@ -175,6 +189,7 @@ impl From<LoopDraft> for deploy::LoopDraft {
                 .map(|(port, limit)| (port, limit.into()))
                 .collect(),
             listens: draft.listens,
+            fallback: draft.fallback,
             policy: draft.policy.into(),
         }
     }
@@ -352,6 +367,7 @@ fn draft(spec: &model::LoopSpec, component: &str) -> LoopDraft {
             .map(|(port, limit)| (port.clone(), (*limit).into()))
             .collect(),
         listens: spec.listens.clone(),
+        fallback: spec.fallback.map(|digest| digest.to_string()),
         policy: spec.policy.into(),
     }
 }

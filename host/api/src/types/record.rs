@@ -178,6 +178,13 @@ pub enum Event {
         /// Output step beyond what the old controller would have done, in % of span.
         bump_percent: Option<f64>,
     },
+    /// The switch moved an output farther than the loop allows, and its policy lets that pass.
+    OverBump {
+        /// Step of the output beyond what the old controller would have done, in % of span.
+        bump_percent: Option<f64>,
+        /// What the loop allows, in % of span.
+        limit_percent: f64,
+    },
     /// A fault in probation sent the loop back to the revision before.
     RolledBack {
         /// The revision left.
@@ -335,6 +342,13 @@ impl Event {
                 from_digest: from_digest.to_string(),
                 by: by.clone(),
                 bump_percent: finite(*bump_percent),
+            },
+            model::Event::OverBump {
+                bump_percent,
+                limit_percent,
+            } => Self::OverBump {
+                bump_percent: finite(*bump_percent),
+                limit_percent: *limit_percent,
             },
             model::Event::RolledBack { from, reason } => Self::RolledBack {
                 from: *from,

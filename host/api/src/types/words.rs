@@ -75,6 +75,16 @@ words! {
 }
 
 words! {
+    /// What a loop does when a change would step an output farther than it allows.
+    OnBump = model::OnBump {
+        /// The old revision stays.
+        Refuse,
+        /// The new one takes over, and the record says by how much.
+        Alarm,
+    }
+}
+
+words! {
     /// How far a value may be trusted.
     Quality = model::Quality {
         /// Not usable for control.

@@ -73,6 +73,7 @@ pub(crate) fn record(owner: &HostId, seq: u64, state: Vec<u8>) -> Record {
         setpoint: 1.5,
         manual: vec![40.0],
         readings: readings(),
+        heard: vec![],
         wanted: vec![41.0],
         outputs: vec![42.0],
         state: Arc::from(state),

@@ -58,6 +58,7 @@ fn setup() -> (LoopSpec, Wiring) {
         replicas: 3,
         limits: [("out".to_owned(), limit)].into(),
         listens: vec![],
+        fallback: None,
         policy: Policy::default(),
     };
     let wiring = Wiring::new(&spec, &descriptor).unwrap();

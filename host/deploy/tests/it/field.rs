@@ -135,6 +135,7 @@ fn record(home: &Home, here: &HostId, events: Vec<Event>) -> Record {
         setpoint: home.spec.setpoint,
         manual: vec![0.0],
         readings: vec![],
+        heard: vec![],
         wanted: vec![0.0],
         outputs: vec![0.0],
         state: Arc::from([1, 2, 3]),

@@ -40,6 +40,7 @@ pub(crate) fn spec(name: &str, setpoint: f64) -> LoopSpec {
         replicas: 3,
         limits: BTreeMap::from([("output".into(), free), ("valve".into(), slow)]),
         listens: vec!["alarms".into()],
+        fallback: None,
         policy: Policy::default(),
     }
 }
@@ -64,6 +65,7 @@ pub(crate) fn record(name: &str, term: u64, seq: u64) -> Arc<Record> {
         setpoint: 50.0,
         manual: vec![12.5],
         readings: vec![Reading::good(49.5, seq * 10_000_000), Reading::unconnected()],
+        heard: vec![],
         wanted: vec![12.5],
         outputs: vec![12.5],
         state: Arc::from(seq.to_le_bytes()),
@@ -102,10 +104,15 @@ pub(crate) fn info(bytes: &[u8]) -> ComponentInfo {
         name: "pid".into(),
         version: "1.2.3".into(),
         descriptor,
+        world: bumpless_core::component::CONTROLLER_WORLD.into(),
         imports: vec!["bumpless:control/io@0.1.0".into()],
         bytes: bytes.len() as u64,
         uploaded_at_unix_ms: 1_700_000_000_000,
         uploaded_by: "operator".into(),
         note: String::new(),
+        labels: [("stage".to_owned(), "pilot".to_owned())].into(),
+        changes: 2,
+        history: Vec::new(),
+        admission: None,
     }
 }
