@@ -52,6 +52,7 @@ impl Room {
                 Ask::Info(digest) => Ok(Told::Info(
                     self.library.get(&digest).map(|info| Box::new((*info).clone())),
                 )),
+                Ask::Stage(digest) => Ok(Told::Stage(self.stage_here(&digest))),
                 Ask::Library => {
                     let (components, removals) = self.library.heads();
                     Ok(Told::Library(components, removals))

@@ -8,7 +8,7 @@
 //! ```
 
 use std::{
-    collections::{BTreeSet, HashMap},
+    collections::{BTreeMap, BTreeSet, HashMap},
     sync::Arc,
     time::{Duration, Instant},
 };
@@ -16,6 +16,7 @@ use std::{
 use bumpless_core::{ComponentInfo, Descriptor, Digest, HostId, LoopSpec, Wiring};
 use bumpless_engine::{Engine, Instance, Prepared};
 use bumpless_loops::HeldRevision;
+use futures_util::future::join_all;
 use parking_lot::Mutex;
 use tokio::sync::Semaphore;
 
@@ -23,9 +24,10 @@ use crate::{
     book::on_disk,
     error::{Error, Words, chain},
     holder::wanted_revisions,
-    limits::{FETCH_WAIT, PREPARED_AHEAD_MAX, PREPARED_KEPT_MAX, RECONCILE_EVERY, WARM_LIMIT_NS},
+    limits::{FETCH_WAIT, PREPARED_AHEAD_MAX, PREPARED_KEPT_MAX, RECONCILE_EVERY, STAGE_WAIT, WARM_LIMIT_NS},
     room::{Room, count, every},
     roster::back_off,
+    view::{Stage, StageView},
     wire::{Ask, Told},
 };
 
@@ -34,6 +36,19 @@ pub(crate) struct Bench {
     pub(crate) engine: Engine,
     compile: Semaphore,
     ready: Mutex<BTreeSet<Digest>>,
+    /// Being compiled, or waiting for that.
+    compiling: Mutex<BTreeSet<Digest>>,
+    /// Could not be made ready at the last try, and why.
+    failed: Mutex<BTreeMap<Digest, String>>,
+}
+
+/// Says that a component is being compiled, for as long as it lives.
+struct Compiling<'a>(&'a Bench, Digest);
+
+impl Drop for Compiling<'_> {
+    fn drop(&mut self) {
+        self.0.compiling.lock().remove(&self.1);
+    }
 }
 
 impl Bench {
@@ -42,6 +57,8 @@ impl Bench {
             engine,
             compile: Semaphore::new(1),
             ready: Mutex::default(),
+            compiling: Mutex::default(),
+            failed: Mutex::default(),
         }
     }
 
@@ -54,9 +71,21 @@ impl Bench {
         self.ready.lock().contains(digest)
     }
 
+    /// What is known of a component here beside its bytes.
+    pub(crate) fn stage(&self, digest: &Digest) -> Option<Stage> {
+        if self.is_ready(digest) {
+            Some(Stage::Ready)
+        } else if self.compiling.lock().contains(digest) {
+            Some(Stage::Compiling)
+        } else {
+            self.failed.lock().get(digest).cloned().map(Stage::Failed)
+        }
+    }
+
     /// Forgets a removed component.
     pub(crate) fn forget(&self, digest: &Digest) {
         self.ready.lock().remove(digest);
+        self.failed.lock().remove(digest);
         self.engine.forget(digest);
     }
 }
@@ -146,16 +175,60 @@ impl Room {
             self.bench.ready.lock().insert(digest);
             return Ok(prepared);
         }
+        let end = self.compiled(digest, first).await;
+        let mut failed = self.bench.failed.lock();
+        match &end {
+            Ok(_) => {
+                failed.remove(&digest);
+                self.bench.ready.lock().insert(digest);
+            }
+            Err(error) => {
+                failed.retain(|known, _| self.library.get(known).is_some());
+                failed.insert(digest, error.to_string());
+            }
+        }
+        drop(failed);
+        end
+    }
+
+    async fn compiled(self: &Arc<Self>, digest: Digest, first: Option<&HostId>) -> Result<Arc<Prepared>, Error> {
         let bytes = self.bytes_of(digest, first).await?;
+        self.bench.compiling.lock().insert(digest);
+        let _compiling = Compiling(&self.bench, digest);
         let _turn = self.bench.compile.acquire().await.map_err(|_| stopping())?;
         let engine = self.bench.engine.clone();
         let made = on_disk(move || engine.prepare(&bytes)).await?;
-        let prepared = made.map_err(|error| {
+        made.map_err(|error| {
             count(&self.tallies.prepares_failed);
             engine_error(&error)
-        })?;
-        self.bench.ready.lock().insert(digest);
-        Ok(prepared)
+        })
+    }
+
+    /// How far this host is with a component.
+    pub(crate) fn stage_here(&self, digest: &Digest) -> Stage {
+        self.bench.stage(digest).unwrap_or_else(|| {
+            if self.store.has_component(digest) {
+                Stage::Bytes
+            } else {
+                Stage::Nothing
+            }
+        })
+    }
+
+    /// How far each host is with a component, by name.
+    pub(crate) async fn stages(self: &Arc<Self>, digest: Digest) -> Vec<StageView> {
+        let mut hosts = self.roster.others();
+        hosts.push(self.here.clone());
+        hosts.sort();
+        join_all(hosts.into_iter().map(|host| async move {
+            let stage = match self.ask(&host, Ask::Stage(digest), STAGE_WAIT).await {
+                Ok(Told::Stage(stage)) => stage,
+                Ok(_) => Stage::Unknown("it gave an answer to another question".to_owned()),
+                Err(error) => Stage::Unknown(error.words().reason.clone()),
+            };
+            StageView { host, stage }
+        }))
+        .await
     }
 
     /// A revision that can be stepped here: instantiated, and started once so that its first cycle is not its first call.

@@ -16,6 +16,7 @@ use futures_util::future::join_all;
 use tokio::{sync::oneshot, time::timeout};
 
 use crate::{
+    admission::step_warnings,
     bench::stopping,
     draft::LoopDraft,
     error::{Error, Words, chain},
@@ -320,6 +321,7 @@ impl Room {
         let facts = |point: &_| self.point_facts(point, &id);
         let spec = plan::spec(draft, info.digest, &info.descriptor, &self.ground(&facts))?;
         self.check_fallback(&spec, info, fallback)?;
+        let warnings = step_warnings(info, &spec, false)?;
         if self.book.len() >= LOOPS_MAX {
             return Err(Error::busy(
                 format!("the cell has {LOOPS_MAX} loops, the most it may have"),
@@ -366,6 +368,7 @@ impl Room {
             hand_over: None,
             dropped_parameters: Vec::new(),
             dropped_ports: Vec::new(),
+            warnings,
         })
     }
 
@@ -386,6 +389,10 @@ impl Room {
         }
         self.settle_locked(&id).await?;
         let current = &self.book.find(&id)?.current.clone();
+        // What ran before within this limit may always be gone back to, and so may what was chosen for the worst case.
+        let ran = |past: &LoopSpec| past.digest == spec.digest && past.step_limit_ns() == spec.step_limit_ns();
+        let known = intent.revisions().any(ran) || current.fallback == Some(spec.digest);
+        let warnings = step_warnings(info, &spec, known)?;
         let end = |revision, unchanged, hand_over| ApplyEnd {
             id: id.clone(),
             revision,
@@ -394,6 +401,7 @@ impl Room {
             hand_over,
             dropped_parameters: dropped.parameters.clone(),
             dropped_ports: dropped.ports.clone(),
+            warnings: warnings.clone(),
         };
         if plan::same(current, &spec) {
             return Ok(end(current.revision, true, None));

@@ -21,7 +21,10 @@ use crate::{
     orders::command_wait,
     plan,
     room::{DeployArrival, Parts, Room},
-    view::{ApplyEnd, Call, CallEnd, CommandEnd, ComponentView, Counters, HostView, LoopView, PointView},
+    view::{
+        ApplyEnd, Call, CallEnd, CommandEnd, ComponentView, Counters, HostView, LoopView, PointView, Relabel,
+        StageView, Upload,
+    },
     wire::{Amend, Ask, Told},
 };
 
@@ -62,14 +65,48 @@ impl Deploy {
         self.room.arrive(arrival);
     }
 
-    /// Takes a component in: inspects, compiles, keeps and announces it. `by` and `note` are for people, at most 512
-    /// characters each. The same bytes again change nothing.
+    /// Takes a component in without labels or force; see [`Deploy::take_in`].
     ///
     /// # Errors
-    /// [`Error::Invalid`] for what is no controller, [`Error::Refused`] for another component of this name and version,
-    /// [`Error::Busy`] when too many are being uploaded or the library is full, [`Error::Store`].
+    /// As [`Deploy::take_in`].
     pub async fn upload(&self, bytes: Vec<u8>, by: &str, note: &str) -> Result<ComponentInfo, Error> {
-        self.room.upload(bytes, by, note).await.map(|info| (*info).clone())
+        let upload = Upload {
+            by: by.to_owned(),
+            note: note.to_owned(),
+            ..Upload::default()
+        };
+        self.take_in(bytes, &upload).await
+    }
+
+    /// Takes a component in: inspects, compiles, tries, keeps and announces it. The same bytes again change nothing.
+    ///
+    /// # Errors
+    /// [`Error::Invalid`] for what is no controller, for what fails its trial, and for words and labels that cannot be;
+    /// [`Error::Refused`] for another component of this name and version; [`Error::Busy`] when too many are being uploaded
+    /// or the library is full; [`Error::Store`]. Then nothing of it stays.
+    pub async fn take_in(&self, bytes: Vec<u8>, upload: &Upload) -> Result<ComponentInfo, Error> {
+        self.room.upload(bytes, upload).await.map(|info| (*info).clone())
+    }
+
+    /// What [`Deploy::take_in`] would find, with the report of a trial, also of one that it refuses. Nothing stays.
+    ///
+    /// # Errors
+    /// As [`Deploy::take_in`], except for what fails its trial: its report says so.
+    pub async fn try_out(&self, bytes: Vec<u8>, upload: &Upload) -> Result<ComponentInfo, Error> {
+        self.room.try_out(bytes, upload).await
+    }
+
+    /// Changes labels and note of a component, on every host.
+    ///
+    /// # Errors
+    /// [`Error::NotFound`] for the component or a label to remove, [`Error::Invalid`], [`Error::Store`].
+    pub async fn relabel(&self, reference: &str, change: &Relabel) -> Result<ComponentInfo, Error> {
+        self.room.relabel(reference, change).await.map(|info| (*info).clone())
+    }
+
+    /// How far each host is with a component, by name. Every host is asked, and given two seconds.
+    pub async fn stages(&self, digest: Digest) -> Vec<StageView> {
+        self.room.stages(digest).await
     }
 
     /// The library, by name and version.

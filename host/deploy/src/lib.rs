@@ -15,9 +15,10 @@
 //! by notices and, where those get lost, by comparing marks every second.
 //!
 //! Reading order: `draft`, `view`, `error` (what people see); `wire`, `field` (what this room speaks); `plan` (pure);
-//! `book`, `library`, `roster`, `feed` (what it keeps); `bench`, `holder`, `home`, `change`, `orders` (what it does);
+//! `book`, `library`, `roster`, `feed` (what it keeps); `admission`, `bench`, `holder`, `home`, `change`, `orders` (what it does);
 //! `sync`, `answers`, `service`, `room`, `deploy` (how it hangs together).
 
+mod admission;
 mod answers;
 mod bench;
 mod book;
@@ -49,5 +50,5 @@ pub use field::{CallSink, CommandSink, Field, WithdrawSink};
 pub use room::{DeployArrival, Parts};
 pub use view::{
     ApplyEnd, Call, CallEnd, CommandEnd, ComponentView, Counters, FailureView, HandOverView, HostView, LoopView,
-    PointView,
+    PointView, Relabel, Stage, StageView, Upload,
 };

@@ -4,12 +4,12 @@
 //! Never: runs a component; `bench` does.
 //!
 //! ```text
-//! unknown ──upload or copy──► in the library ──remove──► removed (remembered by time) ──upload again──► in the library
+//! unknown ──upload or copy──► in the library (labels and notes change) ──remove──► removed (remembered by time) ──upload again──► in the library
 //! ```
 
 use std::{collections::BTreeMap, sync::Arc};
 
-use bumpless_core::{ComponentInfo, Digest};
+use bumpless_core::{ComponentInfo, Digest, Edition};
 use bumpless_store::Store;
 use parking_lot::RwLock;
 
@@ -25,7 +25,7 @@ const REMOVED: &str = "components-removed";
 /// Fewest digits of a digest that may stand for it.
 const DIGITS_MIN: usize = 8;
 
-/// A component and when it was uploaded or removed, in ms of Unix time.
+/// A component and when it was removed, in ms of Unix time.
 pub(crate) type Dated = (Digest, u64);
 
 #[derive(Debug, Default)]
@@ -84,34 +84,35 @@ impl Library {
 
     /// The mark of everything, for the comparison with other hosts. Removals do not count: they are told with the list.
     pub(crate) fn mark(&self) -> u64 {
-        self.shelves
-            .read()
-            .infos
-            .keys()
-            .fold(0, |sum, digest| sum ^ mark(&[digest.as_bytes()]))
+        self.shelves.read().infos.values().fold(0, |sum, info| {
+            let edition = info.edition();
+            let parts = [edition.uploaded_at_unix_ms, edition.changes, edition.mark].map(u64::to_le_bytes);
+            let [uploaded, changes, text] = &parts;
+            sum ^ mark(&[info.digest.as_bytes(), uploaded, changes, text])
+        })
     }
 
-    /// Components with their upload times, and removals with theirs.
-    pub(crate) fn heads(&self) -> (Vec<Dated>, Vec<Dated>) {
+    /// Components and how new each copy is, and removals with their times.
+    pub(crate) fn heads(&self) -> (Vec<(Digest, Edition)>, Vec<Dated>) {
         let shelves = self.shelves.read();
         (
-            shelves
-                .infos
-                .values()
-                .map(|i| (i.digest, i.uploaded_at_unix_ms))
-                .collect(),
+            shelves.infos.values().map(|i| (i.digest, i.edition())).collect(),
             shelves.removed.clone(),
         )
     }
 
-    /// Would a component of this upload time be news?
-    pub(crate) fn wants(&self, digest: &Digest, uploaded_at_ms: u64) -> bool {
+    /// Would this copy be news?
+    pub(crate) fn wants(&self, digest: &Digest, edition: &Edition) -> bool {
         let shelves = self.shelves.read();
         let removed = shelves
             .removed
             .iter()
-            .any(|(d, at_ms)| d == digest && *at_ms >= uploaded_at_ms);
-        !removed && !shelves.infos.contains_key(digest) && shelves.infos.len() < COMPONENTS_MAX
+            .any(|(d, at_ms)| d == digest && *at_ms >= edition.uploaded_at_unix_ms);
+        !removed
+            && match shelves.infos.get(digest) {
+                Some(known) => known.edition() < *edition,
+                None => shelves.infos.len() < COMPONENTS_MAX,
+            }
     }
 
     /// What a reference means: `name@version`, `name` (its newest version), a digest or its first digits.

@@ -30,6 +30,24 @@ pub const UPLOADS_MAX: usize = 4;
 /// How long an upload waits for its turn.
 pub const UPLOAD_WAIT: Duration = Duration::from_secs(10);
 
+/// How long a component waits until it is tried: those of all other uploads may be ahead of it.
+pub const TRIAL_WAIT: Duration = Duration::from_secs(45);
+
+/// Processor time of a trial, beyond which it ends early: some hundred cycles of 10 ms each, twice.
+pub const TRIAL_OWN_TIME_MAX: Duration = Duration::from_secs(10);
+
+/// Time of a trial by the clock, beyond which it ends early: its thread waits for all other work.
+pub const TRIAL_TIME_MAX: Duration = Duration::from_secs(30);
+
+/// Longest call in a trial, in ns: far beyond any loop's step, so that a slow component is measured and not guessed at.
+pub const TRIAL_STEP_LIMIT_NS: u64 = 1_000_000_000;
+
+/// Stack of a trial's thread: a guest may use 256 KiB, and a call needs 1 MiB in all.
+pub const TRIAL_STACK_BYTES: usize = 2 * 1024 * 1024;
+
+/// How long another host may take to say how far it is with a component: whoever asks looks again soon.
+pub const STAGE_WAIT: Duration = Duration::from_secs(2);
+
 /// Changes of loops that one home works on at once: each asks every member for something.
 pub const CHANGES_MAX: usize = 16;
 

@@ -140,6 +140,8 @@ pub(crate) struct Room {
     pub(crate) homes: Homes,
     pub(crate) tallies: Tallies,
     pub(crate) uploads: Semaphore,
+    /// One trial at a time: each takes a core for as long as it lasts.
+    pub(crate) trials: Semaphore,
     pub(crate) changes: Semaphore,
     /// Components on their way to other hosts.
     pub(crate) sending: Semaphore,
@@ -203,6 +205,7 @@ impl Room {
             homes: Homes::default(),
             tallies: Tallies::default(),
             uploads: Semaphore::new(UPLOADS_MAX),
+            trials: Semaphore::new(1),
             changes: Semaphore::new(CHANGES_MAX),
             sending: Semaphore::new(SENDING_MAX),
             admission: tokio::sync::Mutex::default(),

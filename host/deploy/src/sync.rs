@@ -70,7 +70,7 @@ impl Room {
                 let joined = (marks.0 ^ ours.0.rotate_left(1), marks.1 ^ ours.1.rotate_left(1));
                 comparing.done.get(from) != Some(&joined) && comparing.now.insert(from.clone())
             }
-            Notice::Component(digest) => self.library.get(digest).is_none(),
+            Notice::Component(digest, edition) => self.library.wants(digest, edition),
             Notice::ComponentGone(..) => true,
             Notice::Intent(id, position) => self.book.wants(id, *position),
             Notice::Gone(tombstone) => self.book.mourns(tombstone),
@@ -90,7 +90,7 @@ impl Room {
                 }
                 compared
             }
-            Notice::Component(digest) => self.copy_component(from, digest).await,
+            Notice::Component(digest, _) => self.copy_component(from, digest).await,
             Notice::ComponentGone(digest, at_ms) => self.component_gone(digest, at_ms).await,
             Notice::Intent(id, _) => self.copy_intent(from, id).await,
             Notice::Gone(tombstone) => self.loop_gone(tombstone).await,
@@ -112,8 +112,8 @@ impl Room {
                         end = end.and(self.component_gone(digest, at_ms).await);
                     }
                 }
-                for (digest, uploaded_ms) in components {
-                    if self.library.wants(&digest, uploaded_ms) {
+                for (digest, edition) in components {
+                    if self.library.wants(&digest, &edition) {
                         end = end.and(self.copy_component(from, digest).await);
                     }
                 }
@@ -151,11 +151,19 @@ impl Room {
             count(&self.tallies.malformed);
             Error::invalid(format!("the summary of component {}: {error}", digest.short()), "")
         })?;
-        if !self.library.wants(&digest, info.uploaded_at_unix_ms) {
+        let edition = info.edition();
+        if !self.library.wants(&digest, &edition) {
             return Ok(());
         }
         self.bytes_of(digest, Some(from)).await?;
-        self.library.keep(Arc::from(info), None).await?;
+        {
+            let _admission = self.admission.lock().await;
+            // A newer copy may have come, or a person may have written something, meanwhile.
+            if !self.library.wants(&digest, &edition) {
+                return Ok(());
+            }
+            self.library.keep(Arc::from(info), None).await?;
+        }
         self.poke();
         Ok(())
     }

@@ -1,33 +1,48 @@
-//! Components in and out of the cell: upload, download, removal.
+//! Components in and out of the cell: upload, trial, download, labels and notes, removal.
 //!
 //! ```text
-//! bytes ──inspected, compiled──► one name and version, one component ──► disk ──► announced ──► copied by every host
+//! bytes ──inspected, compiled──► one name and version, one component ──tried──► disk ──► announced ──► copied by every host
 //! ```
+//! Never: takes in what failed its trial, except by force; leaves anything of what it refused.
 
-use std::sync::Arc;
+use std::{collections::BTreeMap, sync::Arc};
 
-use bumpless_core::{ComponentInfo, Digest, limits::TEXT_CHARS_MAX};
+use bumpless_core::{
+    ComponentInfo, Digest,
+    component::{CONTROLLER_WORLD, check_labels},
+    limits::TEXT_CHARS_MAX,
+};
 use tokio::time::timeout;
 
 use crate::{
+    admission::let_in,
     bench::{engine_error, stopping},
     book::on_disk,
     error::Error,
     library::title,
     limits::UPLOAD_WAIT,
     room::{Room, count, unix_ms},
+    view::{Relabel, Upload},
     wire::Notice,
 };
 
+/// May these words be kept?
+fn check_words(by: &str, note: &str) -> Result<(), Error> {
+    for (what, text) in [("the uploader's name", by), ("the note", note)] {
+        if text.chars().count() > TEXT_CHARS_MAX {
+            return Err(Error::invalid(
+                format!("{what} is longer than {TEXT_CHARS_MAX} characters"),
+                "shorten it",
+            ));
+        }
+    }
+    Ok(())
+}
+
 impl Room {
     /// Takes a component in.
-    pub(crate) async fn upload(
-        self: &Arc<Self>,
-        bytes: Vec<u8>,
-        by: &str,
-        note: &str,
-    ) -> Result<Arc<ComponentInfo>, Error> {
-        let end = self.take_in(bytes, by, note).await;
+    pub(crate) async fn upload(self: &Arc<Self>, bytes: Vec<u8>, upload: &Upload) -> Result<Arc<ComponentInfo>, Error> {
+        let end = self.take_in(bytes.into(), upload).await;
         count(if end.is_ok() {
             &self.tallies.uploads
         } else {
@@ -36,15 +51,18 @@ impl Room {
         end
     }
 
-    async fn take_in(self: &Arc<Self>, bytes: Vec<u8>, by: &str, note: &str) -> Result<Arc<ComponentInfo>, Error> {
-        for (what, text) in [("the uploader's name", by), ("the note", note)] {
-            if text.chars().count() > TEXT_CHARS_MAX {
-                return Err(Error::invalid(
-                    format!("{what} is longer than {TEXT_CHARS_MAX} characters"),
-                    "shorten it",
-                ));
-            }
-        }
+    /// What taking it in would find. Nothing stays.
+    pub(crate) async fn try_out(self: &Arc<Self>, bytes: Vec<u8>, upload: &Upload) -> Result<ComponentInfo, Error> {
+        let (info, _) = self.examined(&bytes.into(), upload).await?;
+        self.forget_unkept(&info.digest);
+        Ok(info)
+    }
+
+    /// Everything before the decision: whether it is a controller, whether there may be one of its name, how its trial
+    /// went. `true` where the library has it already.
+    async fn examined(self: &Arc<Self>, bytes: &Arc<[u8]>, upload: &Upload) -> Result<(ComponentInfo, bool), Error> {
+        check_words(&upload.by, &upload.note)?;
+        check_labels(&upload.labels).map_err(|error| Error::invalid(error.to_string(), ""))?;
         let crowded = |_| {
             Error::busy(
                 format!("other components are being uploaded at host {}", self.here),
@@ -55,44 +73,136 @@ impl Room {
             .await
             .map_err(crowded)?
             .map_err(|_| stopping())?;
-        let bytes: Arc<[u8]> = bytes.into();
-        let (engine, copy) = (self.bench.engine.clone(), Arc::clone(&bytes));
-        let inspection = on_disk(move || engine.inspect(&copy))
+        let copy = Arc::clone(bytes);
+        let digest = on_disk(move || Digest::of(&copy)).await?;
+        if let Some(known) = self.library.get(&digest) {
+            return Ok(((*known).clone(), true));
+        }
+        let (engine, copy) = (self.bench.engine.clone(), Arc::clone(bytes));
+        let (inspection, prepared) = on_disk(move || engine.open(&copy))
             .await?
             .map_err(|error| engine_error(&error))?;
         let (name, version) = (
             inspection.descriptor.name.clone(),
             inspection.descriptor.version.clone(),
         );
-        let _admission = self.admission.lock().await;
-        // Later than its own removal, also where that was said by a host whose clock is ahead.
-        let (_, removals) = self.library.heads();
-        let removed_ms = removals
-            .iter()
-            .find(|(digest, _)| *digest == inspection.digest)
-            .map_or(0, |(_, at_ms)| at_ms + 1);
-        let info = ComponentInfo {
+        let mut info = ComponentInfo {
             digest: inspection.digest,
             name,
             version,
             descriptor: inspection.descriptor,
+            world: CONTROLLER_WORLD.to_owned(),
             imports: inspection.imports,
             bytes: inspection.bytes as u64,
-            uploaded_at_unix_ms: unix_ms().max(removed_ms),
-            uploaded_by: by.to_owned(),
-            note: note.to_owned(),
+            uploaded_at_unix_ms: unix_ms(),
+            uploaded_by: upload.by.clone(),
+            note: upload.note.clone(),
+            labels: upload.labels.clone(),
+            changes: 0,
+            history: Vec::new(),
+            admission: None,
         };
-        if let Some(known) = self.library.admit(&info)? {
-            return Ok(known);
+        // Before the trial, which takes longer; and once more when it comes in.
+        if self.library.admit(&info)?.is_some() {
+            return Ok((info, true));
         }
+        let admission = self.tried(prepared, &info.imports, inspection.compile_time).await?;
+        info.admission = Some(admission);
         info.check().map_err(|error| Error::invalid(error.to_string(), ""))?;
-        let info = Arc::new(info);
-        self.library.keep(Arc::clone(&info), Some(bytes)).await?;
-        self.announce(&Notice::Component(info.digest));
+        Ok((info, false))
+    }
+
+    /// Compiled code of what did not come in is of no use.
+    fn forget_unkept(&self, digest: &Digest) {
+        if self.library.get(digest).is_none() {
+            self.bench.engine.forget(digest);
+        }
+    }
+
+    async fn take_in(self: &Arc<Self>, bytes: Arc<[u8]>, upload: &Upload) -> Result<Arc<ComponentInfo>, Error> {
+        let (mut info, known) = self.examined(&bytes, upload).await?;
+        if known {
+            return Ok(Arc::new(info));
+        }
+        if let Some(admission) = info.admission.take() {
+            let end = let_in(admission, &title(&info), upload.force, &upload.by);
+            info.admission = Some(end.inspect_err(|_| self.forget_unkept(&info.digest))?);
+        }
+        let forced = info
+            .admission
+            .as_ref()
+            .is_some_and(|a| a.verdict == bumpless_core::Verdict::Forced);
+        let info = {
+            let _admission = self.admission.lock().await;
+            if let Some(known) = self.library.admit(&info)? {
+                return Ok(known);
+            }
+            // Later than its own removal, also where that was said by a host whose clock is ahead.
+            let (_, removals) = self.library.heads();
+            let removed_ms = removals
+                .iter()
+                .find(|(digest, _)| *digest == info.digest)
+                .map_or(0, |(_, at_ms)| at_ms + 1);
+            info.uploaded_at_unix_ms = info.uploaded_at_unix_ms.max(removed_ms);
+            let what = if forced { "taken in by force" } else { "uploaded" };
+            info.remember(info.uploaded_at_unix_ms, &upload.by, what);
+            let info = Arc::new(info);
+            self.library.keep(Arc::clone(&info), Some(bytes)).await?;
+            info
+        };
+        self.announce(&Notice::Component(info.digest, info.edition()));
         // Ready here at once, so that what is uploaded can be called. A full engine is told when it matters.
         if let Err(error) = self.prepared(info.digest, None).await {
             tracing::warn!(digest = %info.digest, %error, "an uploaded component is not ready here yet");
         }
+        Ok(info)
+    }
+
+    /// Changes what people wrote about a component, on every host.
+    pub(crate) async fn relabel(&self, reference: &str, change: &Relabel) -> Result<Arc<ComponentInfo>, Error> {
+        check_words(&change.by, change.note.as_deref().unwrap_or_default())?;
+        let _admission = self.admission.lock().await;
+        let mut info = (*self.library.resolve(reference)?).clone();
+        let mut what = Vec::new();
+        for (key, value) in &change.labels {
+            match value {
+                Some(value) if info.labels.get(key) != Some(value) => {
+                    what.push(format!("label {key}={value}"));
+                    info.labels.insert(key.clone(), value.clone());
+                }
+                Some(_) => {}
+                None => {
+                    if info.labels.remove(key).is_none() {
+                        return Err(Error::not_found(
+                            format!("{} has no label {key:?}", title(&info)),
+                            format!("it has {}", list(&info.labels)),
+                        ));
+                    }
+                    what.push(format!("label {key} removed"));
+                }
+            }
+        }
+        check_labels(&info.labels).map_err(|error| Error::invalid(error.to_string(), ""))?;
+        if let Some(note) = change.note.as_ref().filter(|note| **note != info.note) {
+            what.push(
+                if note.is_empty() {
+                    "note removed"
+                } else {
+                    "note changed"
+                }
+                .to_owned(),
+            );
+            info.note.clone_from(note);
+        }
+        if what.is_empty() {
+            return Ok(Arc::new(info));
+        }
+        info.changes += 1;
+        info.remember(unix_ms(), &change.by, &what.join(", "));
+        info.check().map_err(|error| Error::invalid(error.to_string(), ""))?;
+        let info = Arc::new(info);
+        self.library.keep(Arc::clone(&info), None).await?;
+        self.announce(&Notice::Component(info.digest, info.edition()));
         Ok(info)
     }
 
@@ -123,4 +233,13 @@ impl Room {
     pub(crate) async fn component_bytes(self: &Arc<Self>, digest: &Digest) -> Result<Vec<u8>, Error> {
         self.bytes_of(*digest, None).await
     }
+}
+
+/// `a=1, b=2`, or "none".
+fn list(labels: &BTreeMap<String, String>) -> String {
+    if labels.is_empty() {
+        return "none".to_owned();
+    }
+    let labels: Vec<String> = labels.iter().map(|(key, value)| format!("{key}={value}")).collect();
+    labels.join(", ")
 }

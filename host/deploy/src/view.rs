@@ -1,6 +1,6 @@
 //! What the outside sees of a cell: plain data, copied out, never read back as intent.
 
-use std::sync::Arc;
+use std::{collections::BTreeMap, sync::Arc};
 
 use bumpless_core::{
     Applied, ComponentInfo, Digest, HostId, LoopId, LoopSpec, Mode, PointId, Quality, Record, desk::Tally,
@@ -15,6 +15,56 @@ pub struct ComponentView {
     pub used_by: Vec<LoopId>,
     /// Hosts that hold it compiled.
     pub ready_on: Vec<HostId>,
+}
+
+/// How a component comes in.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Upload {
+    /// Who uploads it, at most 512 characters.
+    pub by: String,
+    /// What there is to say about it, at most 512 characters.
+    pub note: String,
+    /// What it is sorted by; see [`bumpless_core::component::check_label`].
+    pub labels: BTreeMap<String, String>,
+    /// Take it in even where its trial refuses it. Its report says who did so.
+    pub force: bool,
+}
+
+/// A change of what people wrote about a component.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Relabel {
+    /// Who changes it, at most 512 characters.
+    pub by: String,
+    /// Another note; none where it stays.
+    pub note: Option<String>,
+    /// Labels to set, and to remove where there is no value.
+    pub labels: BTreeMap<String, Option<String>>,
+}
+
+/// How far a host is with a component.
+#[derive(Debug, Clone, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+pub enum Stage {
+    /// It has nothing of it.
+    Nothing,
+    /// It has its bytes, and compiles it when it is needed.
+    Bytes,
+    /// It is compiling it, or about to.
+    Compiling,
+    /// It can be stepped there.
+    Ready,
+    /// It could not be compiled or loaded; it is tried again.
+    Failed(String),
+    /// The host did not say, and why.
+    Unknown(String),
+}
+
+/// A host and how far it is with a component.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct StageView {
+    /// The host.
+    pub host: HostId,
+    /// How far it is.
+    pub stage: Stage,
 }
 
 /// A loop as a host sees it.
@@ -134,6 +184,8 @@ pub struct ApplyEnd {
     pub dropped_parameters: Vec<String>,
     /// Input ports that the new component does not have: disconnected in a swap.
     pub dropped_ports: Vec<String>,
+    /// What to look at, for example a step that came near the loop's limit when the component was tried.
+    pub warnings: Vec<String>,
 }
 
 /// How a state came over, as the committed record says.
@@ -168,13 +220,13 @@ pub struct Call {
     /// How the replica is chosen.
     pub strategy: bumpless_core::Strategy,
     /// Parameters by name; defaults for the rest. Used where `state` is none.
-    pub parameters: std::collections::BTreeMap<String, f64>,
+    pub parameters: BTreeMap<String, f64>,
     /// State from the call before; none for a first step.
     pub state: Option<Vec<u8>>,
     /// What the outputs hold, by output port name.
-    pub track: std::collections::BTreeMap<String, f64>,
+    pub track: BTreeMap<String, f64>,
     /// Input values by port name.
-    pub inputs: std::collections::BTreeMap<String, f64>,
+    pub inputs: BTreeMap<String, f64>,
     /// Wanted value.
     pub setpoint: f64,
     /// Who decides the output.
@@ -193,7 +245,7 @@ pub struct CallEnd {
     /// State for the next call.
     pub state: Vec<u8>,
     /// Outputs by port name.
-    pub outputs: std::collections::BTreeMap<String, f64>,
+    pub outputs: BTreeMap<String, f64>,
     /// Time inside the component, in ns.
     pub step_ns: u64,
     /// Time until the answer, network included, in ns.

@@ -4,14 +4,14 @@
 //! component's bytes follow their own first bytes as they are, because they are large.
 //! Never: trusts what it reads; every value that matters is checked where it is used.
 
-use bumpless_core::{Command, ComponentInfo, Digest, HostId, Intent, LoopId, LoopSpec, PointId, Record};
+use bumpless_core::{Command, ComponentInfo, Digest, Edition, HostId, Intent, LoopId, LoopSpec, PointId, Record};
 use bumpless_store::Tombstone;
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
 use crate::{
     draft::{Change, LoopDraft},
     error::{Error, Words},
-    view::{ApplyEnd, CommandEnd, PointView},
+    view::{ApplyEnd, CommandEnd, PointView, Stage},
 };
 
 /// Version of these lists. Another one is refused in words, so that a half updated cell says what is the matter.
@@ -55,6 +55,8 @@ pub(crate) enum Ask {
     Bytes(Digest),
     /// A component's summary.
     Info(Digest),
+    /// How far are you with this component?
+    Stage(Digest),
     /// What the library holds.
     Library,
     /// How new each intent is.
@@ -93,8 +95,10 @@ pub(crate) enum Told {
     Points(Vec<PointView>, u32),
     /// A summary, if there is one.
     Info(Option<Box<ComponentInfo>>),
-    /// Components with their upload times, and removals with theirs, in ms of Unix time.
-    Library(Vec<(Digest, u64)>, Vec<(Digest, u64)>),
+    /// How far the host is with a component.
+    Stage(Stage),
+    /// Components and how new each copy is, and removals with their times in ms of Unix time.
+    Library(Vec<(Digest, Edition)>, Vec<(Digest, u64)>),
     /// How new each intent is, and which loops were removed.
     Intents(Vec<(LoopId, Position)>, Vec<Tombstone>),
     /// An intent, if there is one.
@@ -116,8 +120,8 @@ pub(crate) enum Notice {
         /// Of the intents.
         intents: u64,
     },
-    /// A component came.
-    Component(Digest),
+    /// A component came, or what people wrote about it changed.
+    Component(Digest, Edition),
     /// A component was removed, at this time in ms of Unix time.
     ComponentGone(Digest, u64),
     /// An intent is this new now.

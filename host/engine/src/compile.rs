@@ -20,7 +20,8 @@ use std::{
 };
 
 use crate::{
-    Error, Profile, compile_child,
+    Error, Profile,
+    compile_child::{self, OUTPUT_BYTES_MAX},
     config::{Compile, Limits},
     error::{brief, one_line},
 };
@@ -140,6 +141,7 @@ fn why(status: ExitStatus, words: &str, limits: &Limits) -> Option<Error> {
     const SIGBUS: i32 = 7;
     const SIGSEGV: i32 = 11;
     const SIGXCPU: i32 = 24;
+    const SIGXFSZ: i32 = 25;
     // The last of these is how a thread is refused whose stack does not fit.
     let out_of_memory = [
         "memory allocation of",
@@ -151,6 +153,9 @@ fn why(status: ExitStatus, words: &str, limits: &Limits) -> Option<Error> {
     .any(|sign| words.contains(sign));
     match status.signal() {
         Some(SIGXCPU) => None,
+        Some(SIGXFSZ) => Some(Error::CompileOutput {
+            max_mib: OUTPUT_BYTES_MAX / (1024 * 1024),
+        }),
         // An allocation that fails ends a Rust process with SIGABRT; a stack or map that cannot grow with one of the others.
         Some(SIGILL | SIGABRT | SIGBUS | SIGSEGV) if words.is_empty() || out_of_memory => Some(Error::CompileMemory {
             max_mib: limits.compile_memory_bytes_max / (1024 * 1024),
@@ -217,8 +222,9 @@ mod tests {
     #[test]
     fn a_childs_end_is_explained() {
         let limits = Limits::default();
-        let cases: [(i32, &str, Option<&str>); 6] = [
+        let cases: [(i32, &str, Option<&str>); 7] = [
             (24, "", None),
+            (25, "", Some("more than 192 MiB of machine code")),
             (
                 6,
                 "memory allocation of 9 bytes failed",

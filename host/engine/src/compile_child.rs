@@ -8,23 +8,27 @@ use std::{env, fs, path::Path, time::Duration};
 
 use rustix::process::{Resource, Rlimit, Signal, set_parent_process_death_signal, setpriority_process, setrlimit};
 
-use crate::{Error, Limits, Profile, compile::precompile};
+use crate::{Error, Limits, Profile, compile::precompile, profile::compile_threads};
 
 const PROFILE: &str = "BUMPLESS_COMPILE_PROFILE";
 const GUEST_MEMORY_BYTES: &str = "BUMPLESS_COMPILE_GUEST_MEMORY_BYTES";
 const MEMORY_BYTES: &str = "BUMPLESS_COMPILE_MEMORY_BYTES";
 const TIME_S: &str = "BUMPLESS_COMPILE_TIME_S";
+/// Read by the library that spreads the compilation over threads, which would otherwise take one per core.
+const THREADS: &str = "RAYON_NUM_THREADS";
 
-/// Greatest output in bytes; compiled code takes about four times its component's size, which is at most 32 MiB.
-const OUTPUT_BYTES_MAX: u64 = 512 * 1024 * 1024;
+/// Greatest output in bytes; compiled code takes about four times its component's size, which is at most 32 MiB. The host
+/// reads it into memory, so this is also what a component may cost the host itself.
+pub(crate) const OUTPUT_BYTES_MAX: u64 = 192 * 1024 * 1024;
 
 /// What the host tells its child, as environment variables.
-pub(crate) fn environment(profile: Profile, limits: &Limits) -> [(&'static str, String); 4] {
+pub(crate) fn environment(profile: Profile, limits: &Limits) -> [(&'static str, String); 5] {
     [
         (PROFILE, profile.name().to_owned()),
         (GUEST_MEMORY_BYTES, limits.memory_bytes_max.to_string()),
         (MEMORY_BYTES, limits.compile_memory_bytes_max.to_string()),
         (TIME_S, limits.compile_time_max.as_secs().max(1).to_string()),
+        (THREADS, compile_threads().to_string()),
     ]
 }
 

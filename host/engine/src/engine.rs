@@ -22,7 +22,7 @@ use crate::{
     config::Compile,
     error::brief,
     prepared::Core,
-    profile::{Maps, SPARE_INSTANCES},
+    profile::{INSPECTED_AT_ONCE, Maps, TRIAL_INSTANCES},
     ticker::Ticker,
 };
 
@@ -75,7 +75,8 @@ impl Engine {
             linker: Core::linker(&engine)?,
             limits,
             places: Places::new(instances_max),
-            inspections: Turnstile::new(SPARE_INSTANCES, "inspected"),
+            trials: Places::new(TRIAL_INSTANCES),
+            inspections: Turnstile::new(INSPECTED_AT_ONCE, "inspected"),
             _ticker: Ticker::start(engine.clone())?,
             engine,
         };
@@ -95,14 +96,24 @@ impl Engine {
     /// # Errors
     /// Everything that makes bytes no acceptable controller; the text says what and what to do.
     pub fn inspect(&self, bytes: &[u8]) -> Result<Inspection, Error> {
+        self.open(bytes).map(|(inspection, _)| inspection)
+    }
+
+    /// As [`Engine::inspect`], with the component ready for a trial. It takes no place among the prepared ones, so it is
+    /// gone when it is dropped.
+    ///
+    /// # Errors
+    /// As [`Engine::inspect`].
+    pub fn open(&self, bytes: &[u8]) -> Result<(Inspection, Arc<Prepared>), Error> {
         let (prepared, compile_time) = self.make(bytes)?;
-        Ok(Inspection {
+        let inspection = Inspection {
             digest: *prepared.digest(),
             descriptor: prepared.descriptor().clone(),
             imports: prepared.imports().to_vec(),
             bytes: bytes.len(),
             compile_time,
-        })
+        };
+        Ok((inspection, Arc::new(prepared)))
     }
 
     /// Makes a component ready for instances, from the table, the cache or the compiler, in this order.

@@ -61,6 +61,12 @@ pub enum Error {
         /// The limit.
         max_mib: u64,
     },
+    /// The compiling child wrote more than it may.
+    #[error("the component becomes more than {max_mib} MiB of machine code; simplify it")]
+    CompileOutput {
+        /// The limit.
+        max_mib: u64,
+    },
     /// The compiling child hit its time limit.
     #[error("compiling the component took longer than {max_s} s and was stopped; simplify it or raise the limit")]
     CompileTime {

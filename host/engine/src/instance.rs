@@ -71,6 +71,12 @@ impl Instance {
         self.last_step_ns
     }
 
+    /// Linear memory that the guest has, in bytes; 0 where its life has ended.
+    #[must_use]
+    pub fn memory_bytes(&self) -> usize {
+        self.live.as_ref().map_or(0, |live| live.store.data().memory_bytes())
+    }
+
     /// A first state. `parameters` holds one value per parameter and `track` what the actuator of each output port holds,
     /// both in the descriptor's order.
     ///

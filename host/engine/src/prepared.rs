@@ -30,6 +30,8 @@ pub(crate) struct Core {
     pub(crate) linker: Linker<Sandbox>,
     pub(crate) limits: Limits,
     pub(crate) places: Places,
+    /// Instances for trials: apart from those of loops, so that a full host can still try what is uploaded.
+    pub(crate) trials: Places,
     /// As many at once as there are spare slots.
     pub(crate) inspections: Turnstile,
     /// Never read: it ticks until the last user of the engine is gone.
@@ -112,6 +114,22 @@ impl Prepared {
     /// [`Error::Full`] where the host has no place left, [`Error::Instantiate`] where the guest fails at its start.
     pub fn instantiate(self: &Arc<Self>) -> Result<Instance, Error> {
         let place = self.core.places.take()?;
+        let limit = self.core.limits.describe_time_max;
+        let live = self
+            .make(Instant::now() + limit)
+            .map_err(|failed| Error::Instantiate(failed.fault(limit)))?;
+        Ok(Instance::new(Arc::clone(self), live, place))
+    }
+
+    /// A new instance for a trial, of the few that are kept apart from the loops'.
+    ///
+    /// # Errors
+    /// [`Error::Busy`] where others are being tried, [`Error::Instantiate`] where the guest fails at its start.
+    pub fn instantiate_for_trial(self: &Arc<Self>) -> Result<Instance, Error> {
+        let place = self.core.trials.take().map_err(|_| Error::Busy {
+            doing: "tried",
+            waited_s: 0,
+        })?;
         let limit = self.core.limits.describe_time_max;
         let live = self
             .make(Instant::now() + limit)

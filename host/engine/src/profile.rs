@@ -26,8 +26,13 @@ const MAPS_PER_COMPONENT: usize = 6;
 /// Memory maps left to the rest of the process: thread stacks, allocator arenas, the bus, the database.
 const MAPS_OF_OTHERS: usize = 4096;
 
-/// Slots beyond the instances that loops may have, for components under inspection and descriptors.
-pub(crate) const SPARE_INSTANCES: u32 = 4;
+/// Components that say what they are at once.
+pub(crate) const INSPECTED_AT_ONCE: u32 = 4;
+/// Instances of components that are being tried: one that is used and one that is fresh, and as many again for those that
+/// are just being dropped.
+pub(crate) const TRIAL_INSTANCES: u32 = 4;
+/// Slots beyond the instances that loops may have.
+const SPARE_INSTANCES: u32 = INSPECTED_AT_ONCE + TRIAL_INSTANCES;
 
 /// Stack of a guest in bytes; a thread that steps must have 1 MiB or more in all.
 const STACK_BYTES_MAX: usize = 256 * 1024;
@@ -130,10 +135,10 @@ impl Profile {
         config
     }
 
-    /// An engine that only compiles, with as many threads as the process may use.
+    /// An engine that only compiles, with as many threads as [`compile_threads`] allows.
     pub(crate) fn compiler(self, limits: &Limits) -> Result<wasmtime::Engine, Error> {
         let mut config = self.code_settings(limits);
-        config.parallel_compilation(true);
+        config.parallel_compilation(compile_threads() > 1);
         engine(&config)
     }
 
@@ -146,6 +151,20 @@ impl Profile {
             config.allocation_strategy(InstanceAllocationStrategy::Pooling(pool(instances_max, limits)));
         }
         engine(&config)
+    }
+}
+
+/// Threads that compile where the machine has so many cores: a quarter of them, so that even at the lowest priority most
+/// caches stay with the cycles; one on a small machine. More than four hardly help, and each takes address space.
+pub(crate) fn compile_threads() -> usize {
+    threads_for(std::thread::available_parallelism().map_or(1, NonZeroUsize::get))
+}
+
+const fn threads_for(cores: usize) -> usize {
+    match cores / 4 {
+        0 => 1,
+        few if few < 4 => few,
+        _ => 4,
     }
 }
 
@@ -212,6 +231,12 @@ mod tests {
             "vm.max_map_count = 4000 leaves no room: this process has 500 memory maps and needs 5632 more; \
              run: sysctl -w vm.max_map_count=65536"
         );
+    }
+
+    #[test]
+    fn compiling_leaves_cores_to_the_cycles() {
+        let threads: Vec<usize> = [1, 2, 4, 7, 8, 16, 128].map(threads_for).to_vec();
+        assert_eq!(threads, [1, 1, 1, 1, 2, 4, 4]);
     }
 
     #[test]

@@ -63,6 +63,8 @@ pub(crate) fn faces(descriptor: &Descriptor) -> Arc<[PortFace]> {
 pub(crate) struct Sandbox {
     memory_bytes_max: usize,
     table_elements_max: usize,
+    /// Linear memory that it was given, in bytes.
+    memory_bytes: usize,
     /// What the guest asked for and did not get, in bytes or elements.
     refused: Option<Refused>,
     /// When the call must be over.
@@ -88,7 +90,7 @@ pub(crate) struct Sandbox {
 const OWN_TIME_NS: u64 = 500_000;
 
 /// Processor time of this thread, in ns.
-fn thread_time_ns() -> u64 {
+pub(crate) fn thread_time_ns() -> u64 {
     let time = clock_gettime(ClockId::ThreadCPUTime);
     let (seconds, ns) = (u64::try_from(time.tv_sec), u64::try_from(time.tv_nsec));
     seconds
@@ -121,6 +123,7 @@ impl Sandbox {
         Self {
             memory_bytes_max: limits.memory_bytes_max,
             table_elements_max: limits.table_elements_max,
+            memory_bytes: 0,
             refused: None,
             deadline,
             late_from_ns: None,
@@ -136,6 +139,11 @@ impl Sandbox {
             log: Vec::new(),
             lines_dropped: 0,
         }
+    }
+
+    /// Linear memory that the guest has, in bytes.
+    pub(crate) const fn memory_bytes(&self) -> usize {
+        self.memory_bytes
     }
 
     /// When the next call must be over.
@@ -276,9 +284,11 @@ pub(crate) fn cut(text: &str) -> String {
 }
 
 impl ResourceLimiter for Sandbox {
-    fn memory_growing(&mut self, _current: usize, desired: usize, _maximum: Option<usize>) -> wasmtime::Result<bool> {
+    fn memory_growing(&mut self, current: usize, desired: usize, _maximum: Option<usize>) -> wasmtime::Result<bool> {
         let fits = desired <= self.memory_bytes_max;
-        if !fits {
+        if fits {
+            self.memory_bytes = self.memory_bytes.saturating_add(desired.saturating_sub(current));
+        } else {
             self.refused = Some(Refused::Memory(desired));
         }
         Ok(fits)

@@ -226,6 +226,7 @@ fn apply_end() -> ApplyEnd {
         hand_over: None,
         dropped_parameters: Vec::new(),
         dropped_ports: Vec::new(),
+        warnings: vec!["its longest step took 3 ms".to_owned()],
     }
 }
 

@@ -390,6 +390,9 @@ pub struct Apply {
     pub dropped_parameters: Vec<String>,
     /// Input ports of the old component that the new one does not have: disconnected.
     pub dropped_ports: Vec<String>,
+    /// What to look at, for example a step that came near the loop's limit when the component was tried.
+    #[serde(default)]
+    pub warnings: Vec<String>,
 }
 
 /// How a state came over, as the committed record says.
@@ -417,6 +420,7 @@ impl From<deploy::ApplyEnd> for Apply {
             }),
             dropped_parameters: end.dropped_parameters,
             dropped_ports: end.dropped_ports,
+            warnings: end.warnings,
         }
     }
 }
