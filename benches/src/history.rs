@@ -45,6 +45,8 @@ pub(crate) struct Seen {
     pub(crate) bump_percent: Option<f64>,
     /// A fault on probation sent the loop back.
     pub(crate) rolled_back: bool,
+    /// A step ended with a fault.
+    pub(crate) faulted: bool,
 }
 
 impl Seen {
@@ -65,6 +67,7 @@ impl Seen {
             took_over: kind("took-over").is_some(),
             bump_percent: kind("revised").map(|event| event["bump_percent"].as_f64().unwrap_or(f64::NAN)),
             rolled_back: kind("rolled-back").is_some(),
+            faulted: kind("faulted").is_some(),
         })
     }
 }
@@ -144,6 +147,11 @@ impl History {
             })?;
         }
         Ok(())
+    }
+
+    /// Everything after a place.
+    pub(crate) fn since(&self, place: usize) -> Vec<Seen> {
+        self.shared.seen.lock().iter().skip(place).cloned().collect()
     }
 
     /// Records of a loop that were frozen between the two times.
@@ -303,6 +311,7 @@ mod tests {
             took_over: false,
             bump_percent: None,
             rolled_back: false,
+            faulted: false,
         };
         let records = [
             record(1_000_000_000, 38.0),

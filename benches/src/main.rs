@@ -23,6 +23,7 @@ mod stall;
 mod step;
 mod stress;
 mod swap;
+mod switch;
 
 use std::process::ExitCode;
 
@@ -53,7 +54,9 @@ enum Bench {
     /// How soon strategies leave a replica that is loaded or far away, and come back.
     Select,
     /// 200 swaps on a running loop under load, with and without compiling: lost cycles and the step of the output.
-    Swap,
+    /// With --hz, --count or --kill: hundreds on one fast loop, also while its owner is killed, then components that go wrong
+    /// on probation.
+    Swap(switch::Switching),
     /// A step native and in the sandbox, and the cycle of a loop whose owner, replica and I/O are one process.
     Step,
     /// The other process of `call`.
@@ -117,7 +120,7 @@ fn run(bench: &Bench, options: Options) -> Result<bool, Error> {
         Bench::Call => "call",
         Bench::Failover { .. } => "failover",
         Bench::Select => "select",
-        Bench::Swap => "swap",
+        Bench::Swap(_) => "swap",
         Bench::Step => "step",
         Bench::Burn { core } => return stress::burn(*core).map(|()| true),
         Bench::CallPeer { component } => return peer::run(component).map(|()| true),
@@ -128,7 +131,8 @@ fn run(bench: &Bench, options: Options) -> Result<bool, Error> {
         Bench::Call => call::run(options, &mut report)?,
         Bench::Failover { only } => failover::run(options, *only, &mut report)?,
         Bench::Select => select::run(options, &mut report)?,
-        Bench::Swap => swap::run(options, &mut report)?,
+        Bench::Swap(switching) if switching.is_wanted() => switch::run(options, *switching, &mut report)?,
+        Bench::Swap(_) => swap::run(options, &mut report)?,
         Bench::Step => step::run(options, &mut report)?,
         Bench::CallPeer { .. } | Bench::Burn { .. } => {}
     }

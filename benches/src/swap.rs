@@ -70,7 +70,7 @@ struct Uploads {
 }
 
 /// A component that was never seen before: the same law under another version.
-fn fresh(pid: &[u8], number: u64) -> Option<Vec<u8>> {
+pub(crate) fn fresh(pid: &[u8], number: u64) -> Option<Vec<u8>> {
     // The law's name and version stand side by side in its data; versions elsewhere are those of interfaces.
     let known: &[u8] = b"pid0.1.0";
     let at = pid.windows(known.len()).position(|bytes| bytes == known)?;

@@ -1,0 +1,364 @@
+//! `swap --hz … --count … --kill`: hundreds of swaps on one fast loop, as fast as they come into force, with the owner killed at random moments if
+//! wanted; then components that go wrong on probation.
+//!
+//! ```text
+//! the same law, another component:   pid 0.1.0 ⇄ pid 0.1.1     the output must go on exactly
+//! another law:                       pid ⇄ pidplus             bounded
+//! kills:   owner ─ kill -9 at a random moment of a swap ─► another owner ─► restarted ─► stepping ─► …
+//! probation: traps, spins, returns NaN, jumps, each after a few good cycles ─► rolled back in that same cycle
+//! ```
+//! Up to 200 Hz the replicas share the steps; faster loops are stepped by their owner, as one would run them.
+
+use std::{
+    collections::BTreeMap,
+    sync::{
+        Arc,
+        atomic::{AtomicBool, AtomicU64, Ordering},
+    },
+    thread::JoinHandle,
+    time::{Duration, Instant},
+};
+
+use bumpless_core::Digest;
+use bumpless_io::Clock;
+use bumpless_tests::{Api, Cell, CellOptions, Journal};
+use clap::Args;
+use serde_json::{Value, json};
+
+use crate::{
+    Options,
+    actuator::{self, felt},
+    error::Error,
+    history::{History, Seen, Tally},
+    law,
+    report::{Bound, Report},
+    stall::Watch,
+    swap::fresh,
+};
+
+/// The loop.
+const LOOP: &str = "switched";
+/// Its actuator, with a span of 100.
+const POINT: &str = "plant.0.out";
+/// Rates up to this are shared by the replicas, in Hz.
+const SHARED_HZ_MAX: f64 = 200.0;
+/// Good cycles of a component that then goes wrong; fewer than the probation has.
+const GOOD_CYCLES: u32 = 5;
+/// Each kind of misdeed is tried so often.
+const MISDEEDS_EACH: u64 = 5;
+/// Misdeeds with their parameters.
+const MISDEEDS: [(&str, &[(&str, f64)]); 4] = [
+    ("traps", &[]),
+    ("spins", &[]),
+    ("returns-nan", &[]),
+    ("jumps", &[("by", 50.0)]),
+];
+/// Between the return of a killed host and the next kill, at most, in ms; the moment is spread over it.
+const KILL_SPREAD_MS: u64 = 400;
+/// Longest wait for a swap that a kill hit.
+const SETTLE: Duration = Duration::from_secs(30);
+
+/// What is switched how. Without any of these `swap` runs its own plan.
+#[derive(Debug, Clone, Copy, Args)]
+pub(crate) struct Switching {
+    /// One loop at this rate, in Hz, swapped as fast as the swaps come into force; 1 to 1000, usually 1000.
+    #[arg(long, value_parser = rate)]
+    hz: Option<f64>,
+    /// So many swaps of that loop, usually 500.
+    #[arg(long)]
+    count: Option<u64>,
+    /// Kill that loop's owner again and again while it is swapped.
+    #[arg(long)]
+    kill: bool,
+}
+
+fn rate(text: &str) -> Result<f64, String> {
+    let hz: f64 = text.parse().map_err(|_| "a number is wanted".to_owned())?;
+    (1.0..=1000.0)
+        .contains(&hz)
+        .then_some(hz)
+        .ok_or_else(|| "1 to 1000 are possible".to_owned())
+}
+
+impl Switching {
+    /// Is anything of this wanted?
+    pub(crate) const fn is_wanted(&self) -> bool {
+        self.hz.is_some() || self.count.is_some() || self.kill
+    }
+
+    fn hz(&self) -> f64 {
+        self.hz.unwrap_or(1000.0)
+    }
+
+    fn period_ns(&self) -> u64 {
+        (1e9 / self.hz()) as u64
+    }
+
+    /// A loop file. A takeover before 80 % of a millisecond would meet an owner that only waited for its turn.
+    fn draft(&self, component: &str, parameters: &BTreeMap<&str, f64>, deviation_percent: Option<f64>) -> Value {
+        let shared = self.hz() <= SHARED_HZ_MAX;
+        json!({
+            "name": LOOP,
+            "component": component,
+            "period_ms": 1e3 / self.hz(),
+            "ports": { "pv": "plant.0.pv", "out": POINT },
+            "parameters": parameters,
+            "setpoint": 40.0,
+            "strategy": if shared { "round-robin" } else { "local" },
+            "policy": {
+                "takeover_part": if shared { 0.4 } else { 0.8 },
+                "probation_deviation_percent": deviation_percent,
+            },
+        })
+    }
+}
+
+/// Has the cell while the loop is swapped, and kills the loop's owner again and again, if it is to.
+struct Killer {
+    stop: Arc<AtomicBool>,
+    kills: Arc<AtomicU64>,
+    thread: JoinHandle<Result<Cell, Error>>,
+}
+
+impl Killer {
+    fn start(mut cell: Cell, kill: bool, history: Arc<History>) -> Result<Self, Error> {
+        let (stop, kills) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicU64::new(0)));
+        let (stop_there, kills_there) = (Arc::clone(&stop), Arc::clone(&kills));
+        let clock = Clock::start();
+        let thread = std::thread::Builder::new()
+            .name("killer".to_owned())
+            .spawn(move || {
+                while kill && !stop_there.load(Ordering::Relaxed) {
+                    std::thread::sleep(Duration::from_millis(clock.now_ns() / 1_000 * 7_919 % KILL_SPREAD_MS));
+                    let Some(owner) = history.last(LOOP).map(|record| record.owner) else {
+                        continue;
+                    };
+                    let place = history.place();
+                    cell.host(&owner)?.kill9();
+                    kills_there.fetch_add(1, Ordering::Relaxed);
+                    history.wait("another owner", place, |record| record.owner != owner)?;
+                    cell.restart(&owner)?;
+                    cell.wait_joined()?;
+                }
+                Ok(cell)
+            })
+            .map_err(Error::io("the killer's thread cannot be started"))?;
+        Ok(Self { stop, kills, thread })
+    }
+
+    /// Ends it; gives the cell back, and how many kills there were.
+    fn finish(self) -> Result<(Cell, u64), Error> {
+        self.stop.store(true, Ordering::Relaxed);
+        match self.thread.join() {
+            Ok(cell) => Ok((cell?, self.kills.load(Ordering::Relaxed))),
+            Err(_) => Err(Error::Waited {
+                what: "the end of the kills".to_owned(),
+                seconds: 0,
+            }),
+        }
+    }
+}
+
+/// Runs the bench.
+pub(crate) fn run(options: Options, switching: Switching, report: &mut Report) -> Result<(), Error> {
+    let count = if options.quick {
+        switching.count.min(40)
+    } else {
+        switching.count
+    };
+    report.progress(&format!(
+        "a plant and three controllers in four processes, a loop at {} Hz, {count} swaps{}",
+        switching.hz(),
+        if switching.kill {
+            ", the owner killed again and again"
+        } else {
+            ""
+        }
+    ));
+    let fopdt = "{ count = 1, gain = 1.0, tau_s = 1.0, dead_time_s = 0.1, noise = 0.002 }";
+    let cell = Cell::start(CellOptions::first_order(fopdt))?;
+    let api = cell.plant.api();
+    api.upload_stock(&["pid", "pidplus"])?;
+    let pid = law::component_path("pid")?;
+    let pid = std::fs::read(&pid).map_err(Error::io(format!("{} cannot be read", pid.display())))?;
+    let twin = fresh(&pid, 11).ok_or_else(|| Error::Missing(law::component_path("pid").unwrap_or_default()))?;
+    api.upload_bytes(&twin)?;
+    let (pid, twin) = (Digest::of(&pid).to_string(), Digest::of(&twin).to_string());
+    let tuning = BTreeMap::from([("k", 1.5), ("ti", 1.0), ("td", 0.05)]);
+    api.apply(&switching.draft(&pid, &tuning, None))?;
+    let history = Arc::new(History::follow(&api, &[LOOP])?);
+    let watch = Watch::start();
+    let clock = Clock::start();
+    history.wait("the first cycles", 0, |record| record.seq > 100)?;
+
+    let before = Tally::ask(&api, LOOP)?;
+    let from_ns = clock.now_ns();
+    let killer = Killer::start(cell, switching.kill, Arc::clone(&history))?;
+    let mut refused = 0_u64;
+    let mut last_refusal = String::new();
+    let plus = "pidplus";
+    // The same law twice, then another law and back.
+    let ring = [twin.as_str(), pid.as_str(), plus, pid.as_str()];
+    for (number, to) in ring
+        .iter()
+        .cycle()
+        .take(usize::try_from(count).unwrap_or(0))
+        .enumerate()
+    {
+        if number % 8 == 0 {
+            drop(api.setpoint(LOOP, if number % 16 == 0 { 60.0 } else { 40.0 }));
+        }
+        match api.swap(LOOP, to) {
+            Ok(_) => {}
+            Err(error) => {
+                refused += 1;
+                last_refusal = error.to_string();
+            }
+        }
+    }
+    let (cell, kills) = killer.finish()?;
+    let after = Tally::ask(&api, LOOP)?;
+    let to_ns = clock.now_ns();
+
+    report.progress(&format!(
+        "{} components that go wrong on probation",
+        MISDEEDS_EACH * MISDEEDS.len() as u64
+    ));
+    // What a kill left behind is settled first, so that each misdeed starts from a sound loop.
+    settle(&api, &pid)?;
+    let misdeeds_from_ns = clock.now_ns();
+    let mut wrong = Vec::new();
+    for (name, parameters) in MISDEEDS {
+        let path = law::component_path(&format!("guests/{name}"))?;
+        api.upload(&path)?;
+        for _ in 0..MISDEEDS_EACH {
+            wrong.push(misdeed(&api, &history, switching, &pid, name, parameters)?);
+        }
+    }
+    let misdeeds_to_ns = clock.now_ns();
+    // The journal reaches the disk within a quarter of a second.
+    std::thread::sleep(Duration::from_millis(500));
+    let stalls = watch.finish();
+    let journal = cell.journal()?;
+
+    report.told("swap.rate", switching.hz(), "Hz");
+    report.told("swap.kills", kills as f64, "kills");
+    let seen = history.between(LOOP, from_ns, to_ns);
+    tell_switches(report, &seen, &[&pid, &twin], count, refused, switching.kill);
+    if refused > 0 {
+        report.progress(&format!("the last swap that was not taken: {last_refusal}"));
+    }
+    let part = felt(&journal, POINT, switching.period_ns(), (from_ns, to_ns), &stalls);
+    let taken_over = seen.iter().filter(|record| record.took_over).count();
+    // Each death of an owner may cost a cycle at this rate; what is beyond that is ours.
+    let lost = if switching.kill { kills as f64 } else { 0.0 };
+    part.tell(report, "swap.swapping", Bound::AtMost(lost), Bound::None);
+    report.told("swap.swapping.takeovers", taken_over as f64, "takeovers");
+    after.tell_since(before, report, "swap.swapping");
+    tell_misdeeds(report, &journal, &wrong);
+    let part = felt(
+        &journal,
+        POINT,
+        switching.period_ns(),
+        (misdeeds_from_ns, misdeeds_to_ns),
+        &stalls,
+    );
+    part.tell(report, "swap.probation", Bound::AtMost(0.0), Bound::None);
+    actuator::tell_writers(report, "swap", &journal);
+    report.told("swap.feed_records_lost", history.lost() as f64, "records");
+    stalls.tell(report, "swap");
+    Ok(())
+}
+
+/// Brings the loop to a component, whatever a kill left behind.
+fn settle(api: &Api, digest: &str) -> Result<(), Error> {
+    let started = Instant::now();
+    loop {
+        match api.swap(LOOP, digest) {
+            Ok(_) => return Ok(()),
+            Err(error) if started.elapsed() > SETTLE => return Err(error.into()),
+            Err(_) => std::thread::sleep(Duration::from_millis(100)),
+        }
+    }
+}
+
+/// The first cycle after the switch that went wrong, and the cycle in which the loop was back.
+#[derive(Debug, Clone, Copy)]
+struct Wrong {
+    faulted_seq: Option<u64>,
+    back_seq: Option<u64>,
+}
+
+fn misdeed(
+    api: &Api,
+    history: &History,
+    switching: Switching,
+    sound: &str,
+    name: &str,
+    parameters: &[(&'static str, f64)],
+) -> Result<Wrong, Error> {
+    settle(api, sound)?;
+    let place = history.place();
+    let mut given = BTreeMap::from([("after", f64::from(GOOD_CYCLES))]);
+    given.extend(parameters.iter().copied());
+    // The misdeed may come before the answer: then the change is told to have gone back, which is what is looked for.
+    drop(api.apply(&switching.draft(name, &given, Some(5.0))));
+    let back = history.wait("the way back", place, |record| record.rolled_back)?;
+    let seen = history.since(place);
+    let first = seen.iter().find(|record| record.faulted);
+    Ok(Wrong {
+        faulted_seq: first.map(|record| record.seq),
+        back_seq: Some(back.seq),
+    })
+}
+
+/// The switches, told apart by whether the law stayed the same.
+fn tell_switches(report: &mut Report, seen: &[Seen], one_law: &[&str], count: u64, refused: u64, kill: bool) {
+    let (mut done, mut number, mut worst) = (0_u64, [0_u64; 2], [0.0_f64; 2]);
+    for pair in seen.windows(2) {
+        let [before, switch] = pair else { continue };
+        let Some(bump) = switch.bump_percent else { continue };
+        let same = [before, switch]
+            .iter()
+            .all(|record| one_law.contains(&record.digest.as_str()));
+        let kind = usize::from(same);
+        done += 1;
+        number[kind] += 1;
+        // What is no number is no bump that was measured: it must not pass.
+        worst[kind] = worst[kind].max(if bump.is_finite() { bump } else { f64::INFINITY });
+    }
+    report.figure(
+        "swap.swaps",
+        (done + refused) as f64,
+        "swaps",
+        Bound::AtLeast(count as f64),
+    );
+    let not_taken = if kill { Bound::None } else { Bound::AtMost(0.0) };
+    report.figure("swap.swaps_not_taken", refused as f64, "swaps", not_taken);
+    report.told("swap.same_law.swaps", number[1] as f64, "swaps");
+    report.figure("swap.same_law.bump", worst[1], "% of span", Bound::AtMost(0.0));
+    report.told("swap.other_law.swaps", number[0] as f64, "swaps");
+    report.figure("swap.other_law.bump", worst[0], "% of span", Bound::AtMost(0.1));
+}
+
+fn tell_misdeeds(report: &mut Report, journal: &Journal, wrong: &[Wrong]) {
+    let same = wrong
+        .iter()
+        .filter(|w| w.faulted_seq.is_some() && w.faulted_seq == w.back_seq);
+    let written = same
+        .clone()
+        .filter(|w| journal.of(POINT).any(|write| Some(write.seq) == w.back_seq));
+    report.told("swap.probation.misdeeds", wrong.len() as f64, "components");
+    report.figure(
+        "swap.probation.back_in_same_cycle",
+        same.count() as f64,
+        "components",
+        Bound::AtLeast(wrong.len() as f64),
+    );
+    report.figure(
+        "swap.probation.written_in_that_cycle",
+        written.count() as f64,
+        "components",
+        Bound::AtLeast(wrong.len() as f64),
+    );
+}
