@@ -161,11 +161,7 @@ impl Killer {
 
 /// Runs the bench.
 pub(crate) fn run(options: Options, switching: Switching, report: &mut Report) -> Result<(), Error> {
-    let count = if options.quick {
-        switching.count.min(40)
-    } else {
-        switching.count
-    };
+    let count = switching.count.unwrap_or_else(|| options.count(500, 40));
     report.progress(&format!(
         "a plant and three controllers in four processes, a loop at {} Hz, {count} swaps{}",
         switching.hz(),
