@@ -17,7 +17,7 @@ use bumpless_deploy::{Deploy, DeployArrival, Parts};
 use bumpless_engine::Engine;
 use bumpless_io::{Clock, IoServer};
 use bumpless_loops::{Loops, LoopsEvent};
-use bumpless_store::{RecordWriter, Store};
+use bumpless_store::{CycleLog, RecordWriter, Store};
 use tokio::{
     net::TcpListener,
     sync::{mpsc, watch},
@@ -101,6 +101,14 @@ pub async fn run(config: Config) -> Result<Running, Error> {
         .await?
         .map_err(|e| Error::start("the store", e))?;
     let writer = RecordWriter::start(store.clone()).map_err(|e| Error::start("the record writer", e))?;
+    let (log_of, bytes_max) = (store.clone(), config.history_bytes_max);
+    let cycles = blocking(move || {
+        bytes_max
+            .map(|bytes_max| CycleLog::open(&log_of, bytes_max))
+            .transpose()
+    })
+    .await?
+    .map_err(|e| Error::start("the log of cycles", e))?;
     let mut engine_config = config.engine.clone();
     engine_config.cache_dir = Some(config.data.join("compiled"));
     engine_config.cache_key = store
@@ -169,6 +177,7 @@ pub async fn run(config: Config) -> Result<Running, Error> {
         session: session.clone(),
         store,
         writer: Arc::new(writer),
+        cycles: cycles.map(Arc::new),
         engine,
         io: io.clone(),
         clock,

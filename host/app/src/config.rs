@@ -13,6 +13,10 @@
 //! [api]
 //! listen = "127.0.0.1:8480"
 //!
+//! [history]                        # of the loops at home here
+//! enabled = true
+//! bytes_max_mib = 512              # then the oldest cycles go
+//!
 //! [[bus]]                          # points, if this host serves any
 //! id = "plant"
 //! driver = "sim"
@@ -59,6 +63,8 @@ pub struct Config {
     pub engine: bumpless_engine::Config,
     /// The threads of the loops.
     pub loops: bumpless_loops::Config,
+    /// Bytes on disk for recorded cycles; none to record none.
+    pub history_bytes_max: Option<u64>,
 }
 
 /// The file.
@@ -81,6 +87,8 @@ pub(crate) struct File {
     engine: EngineTable,
     #[serde(default)]
     loops: LoopsTable,
+    #[serde(default)]
+    history: HistoryTable,
 }
 
 fn data_default() -> PathBuf {
@@ -157,6 +165,24 @@ enum CompileWord {
 struct LoopsTable {
     #[serde(skip_serializing_if = "Option::is_none")]
     workers: Option<usize>,
+}
+
+/// Recorded cycles of the loops at home here.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+struct HistoryTable {
+    enabled: bool,
+    bytes_max_mib: u64,
+}
+
+impl Default for HistoryTable {
+    fn default() -> Self {
+        // A day of ten loops at 10 Hz, about, and no surprise on a small disk.
+        Self {
+            enabled: true,
+            bytes_max_mib: 512,
+        }
+    }
 }
 
 impl Config {
@@ -265,6 +291,7 @@ impl File {
             buses,
             engine: self.engine.checked(&wrong)?,
             loops: self.loops.checked(&wrong)?,
+            history_bytes_max: self.history.checked(&wrong)?,
         })
     }
 }
@@ -320,6 +347,17 @@ impl LoopsTable {
         Ok(bumpless_loops::Config {
             workers: in_range(wrong, "loops.workers", self.workers, default.workers, 1, 64)?,
         })
+    }
+}
+
+impl HistoryTable {
+    fn checked(&self, wrong: &dyn Fn(&str, String) -> Error) -> Result<Option<u64>, Error> {
+        let (low, high) = (
+            bumpless_store::CYCLE_BYTES_MAX.start() >> 20,
+            bumpless_store::CYCLE_BYTES_MAX.end() >> 20,
+        );
+        let mib = in_range(wrong, "history.bytes_max_mib", Some(self.bytes_max_mib), 0, low, high)?;
+        Ok(self.enabled.then_some(mib << 20))
     }
 }
 
@@ -381,6 +419,7 @@ mod tests {
             bumpless_engine::Limits::default().compile_memory_bytes_max
         );
         assert!(matches!(config.engine.compile, bumpless_engine::Compile::Child { .. }));
+        assert_eq!(config.history_bytes_max, Some(512 * 1024 * 1024));
     }
 
     #[test]
@@ -407,12 +446,14 @@ mod tests {
             compile = "in-process"
             [loops]
             workers = 3
+            [history]
+            enabled = false
         "#;
         let config = parse(text).expect("a good file");
         assert_eq!((config.io, config.control), (true, true));
         assert_eq!(config.data, Path::new("/var/lib/bumpless"));
         assert_eq!((config.cell.lease_ms, config.cell.scouting), (300, true));
-        assert_eq!(config.loops.workers, 3);
+        assert_eq!((config.loops.workers, config.history_bytes_max), (3, None));
         assert!(matches!(config.engine.compile, bumpless_engine::Compile::InProcess));
         let BusConfig::Sim(sim) = &config.buses.buses[0] else {
             panic!("a simulated bus")
@@ -423,7 +464,7 @@ mod tests {
     #[test]
     fn bad_files_say_where_and_what_helps() {
         let bus = "[[bus]]\nid = \"plant\"\ndriver = \"sim\"\n";
-        let table: [(String, &[&str]); 17] = [
+        let table: [(String, &[&str]); 19] = [
             (String::new(), &["host.toml", "missing field `host`"]),
             (
                 "host = \"A\"\n[cell]\nname = \"demo\"".into(),
@@ -484,6 +525,14 @@ mod tests {
             (
                 format!("{LEAST}[loop]\nworkers = 2"),
                 &["line 4", "unknown field `loop`", "`loops`"],
+            ),
+            (
+                format!("{LEAST}[history]\nbytes_max_mib = 15"),
+                &["key history.bytes_max_mib", "it is 15; use 16 to 65536"],
+            ),
+            (
+                format!("{LEAST}[history]\nbytes = 15"),
+                &["line 5, key bytes", "unknown field `bytes`", "`bytes_max_mib`"],
             ),
             (format!("{LEAST}[[["), &["line 4"]),
         ];

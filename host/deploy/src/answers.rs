@@ -64,6 +64,15 @@ impl Room {
                 Ask::Intent(id) => Ok(Told::Intent(
                     self.book.get(&id).map(|intent| Box::new((*intent).clone())),
                 )),
+                Ask::Cycles(id, window, max) => {
+                    self.cycles_here(&id, window, max).await.map(Box::new).map(Told::Cycles)
+                }
+                Ask::Replay(id, window) => self.replay_here(id, window).await.map(Box::new).map(Told::Replayed),
+                Ask::Backtest(id, trial, window) => {
+                    let report = self.backtest_here(&from, id, *trial, window).await;
+                    report.map(Box::new).map(Told::Tried)
+                }
+                Ask::Shadow(id, ask) => self.shadow_here(&from, id, ask).await,
                 Ask::Records(ids) => {
                     let last = ids.iter().take(RECORDS_ASKED).filter_map(|id| self.feed.last(id));
                     Ok(Told::Records(last.map(|last| (*last.record).clone()).collect()))

@@ -16,13 +16,16 @@
 //!
 //! Reading order: `draft`, `view`, `error` (what people see); `wire`, `field` (what this room speaks); `plan` (pure);
 //! `book`, `library`, `roster`, `feed` (what it keeps); `admission`, `bench`, `holder`, `home`, `change`, `orders` (what it does);
+//! `trials` with `rehearsal`, `replay`, `shadows`, `curve`, `report` (looking back, and trying candidates);
 //! `sync`, `answers`, `service`, `room`, `deploy` (how it hangs together).
 
 mod admission;
 mod answers;
+mod aside;
 mod bench;
 mod book;
 mod change;
+mod curve;
 mod deploy;
 mod error;
 mod feed;
@@ -32,15 +35,20 @@ mod home;
 mod library;
 mod orders;
 mod plan;
+mod rehearsal;
+mod replay;
 mod room;
 mod roster;
 mod service;
+mod shadows;
 mod sync;
+mod trials;
 mod uploads;
 mod wire;
 
 pub mod draft;
 pub mod limits;
+pub mod report;
 pub mod view;
 
 pub use deploy::Deploy;

@@ -125,6 +125,30 @@ pub const GONE_SHOWN: Duration = Duration::from_secs(600);
 /// Hosts that are remembered, present or gone; the bus itself sends to no more.
 pub const HOSTS_MAX: usize = 4_096;
 
+/// Cycles that one replay or backtest looks at: a minute of a loop at 1 kHz, three hours of one at 10 Hz.
+pub const REHEARSED_MAX: u64 = 100_000;
+
+/// How long a replay or backtest may step; what it has by then is its answer.
+pub const REHEARSAL_TIME_MAX: Duration = Duration::from_secs(18);
+
+/// How long it waits for its turn.
+pub const REHEARSAL_TURN_WAIT: Duration = Duration::from_secs(5);
+
+/// How long its asker waits: for its turn, its candidate and its steps, and less than the API's half minute.
+pub const REHEARSAL_WAIT: Duration = Duration::from_secs(28);
+
+/// Replays and backtests at one home at a time: each takes a core, at the lowest priority.
+pub const REHEARSALS_MAX: usize = 2;
+
+/// Recorded cycles in one answer, and their bytes, about.
+pub const RECORDS_TOLD_MAX: usize = 1_000;
+
+/// See [`RECORDS_TOLD_MAX`].
+pub const RECORDS_TOLD_BYTES_MAX: usize = 8 * 1024 * 1024;
+
+/// Cycles of one shadow: a day of a loop at 10 Hz.
+pub const SHADOW_CYCLES_MAX: u64 = 1_000_000;
+
 /// Longest time of a first call on a new instance, in ns: its memory is touched for the first time.
 pub const WARM_LIMIT_NS: u64 = 100_000_000;
 

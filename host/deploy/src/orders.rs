@@ -26,7 +26,7 @@ pub(crate) fn command_wait(period_ns: u64) -> Duration {
 }
 
 impl Room {
-    fn ours(&self, id: &LoopId) -> Result<Arc<Intent>, Error> {
+    pub(crate) fn ours(&self, id: &LoopId) -> Result<Arc<Intent>, Error> {
         let intent = self.book.find(id)?;
         if intent.home == self.here {
             return Ok(intent);
@@ -130,6 +130,7 @@ impl Room {
             tracing::error!(loop_id = %id, %error, "a deleted loop could not be closed; restart this host");
         }
         self.gone(id);
+        self.forget_cycles(id).await;
         if let Some(tombstone) = tombstone {
             self.announce(&Notice::Gone(tombstone));
         }

@@ -207,7 +207,7 @@ fn two_outputs_of_one_point<'a>(spec: &'a LoopSpec, descriptor: &'a Descriptor) 
 }
 
 /// The port that a setpoint is for: `pv` by convention, else the first input.
-fn measured_port(descriptor: &Descriptor) -> Option<&str> {
+pub(crate) fn measured_port(descriptor: &Descriptor) -> Option<&str> {
     let inputs = || descriptor.ports.iter().filter(|p| p.direction == Direction::Input);
     inputs()
         .find(|p| p.name == "pv")

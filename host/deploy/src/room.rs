@@ -22,7 +22,7 @@ use bumpless_core::{CommandId, Digest, HostId, LoopId};
 use bumpless_engine::Engine;
 use bumpless_io::{Clock, IoServer};
 use bumpless_loops::LoopsEvent;
-use bumpless_store::{RecordWriter, Store};
+use bumpless_store::{CycleLog, RecordWriter, Store};
 use parking_lot::Mutex;
 use tokio::{
     runtime::Handle,
@@ -39,8 +39,11 @@ use crate::{
     holder::Holder,
     home::Homes,
     library::Library,
-    limits::{CHANGES_MAX, NOTICES_WAITING_MAX, RECONCILE_EVERY, SENDING_MAX, UPLOADS_MAX, VITALS_EVERY},
+    limits::{
+        CHANGES_MAX, NOTICES_WAITING_MAX, RECONCILE_EVERY, REHEARSALS_MAX, SENDING_MAX, UPLOADS_MAX, VITALS_EVERY,
+    },
     roster::Roster,
+    shadows::Shadows,
     view::Counters,
     wire::{self, Ask, Notice, Told},
 };
@@ -53,6 +56,8 @@ pub struct Parts {
     pub store: Store,
     /// Writes last records behind the cycle. Whoever made it closes it.
     pub writer: Arc<RecordWriter>,
+    /// Keeps every cycle of the loops at home here; none to keep none. Whoever made it closes it.
+    pub cycles: Option<Arc<CycleLog>>,
     /// The sandbox. Every host has one, because every host takes uploads.
     pub engine: Engine,
     /// The points of this host, if it serves any.
@@ -136,6 +141,10 @@ pub(crate) struct Room {
     pub(crate) bench: Bench,
     pub(crate) roster: Roster,
     pub(crate) feed: Feed,
+    pub(crate) cycles: Option<Arc<CycleLog>>,
+    pub(crate) shadows: Shadows,
+    /// Replays and backtests.
+    pub(crate) rehearsals: Semaphore,
     pub(crate) holder: Holder,
     pub(crate) homes: Homes,
     pub(crate) tallies: Tallies,
@@ -168,6 +177,7 @@ impl Room {
             session,
             store,
             writer,
+            cycles,
             engine,
             io,
             clock,
@@ -201,6 +211,9 @@ impl Room {
             bench: Bench::new(engine),
             roster: Roster::new(own.clone()),
             feed: Feed::new(writer),
+            cycles,
+            shadows: Shadows::default(),
+            rehearsals: Semaphore::new(REHEARSALS_MAX),
             holder: Holder::default(),
             homes: Homes::default(),
             tallies: Tallies::default(),
@@ -228,6 +241,7 @@ impl Room {
         for record in room.store.last_records()? {
             room.feed.remember(&Arc::new(record));
         }
+        room.forget_strangers();
         for host in room.session.hosts() {
             room.roster.up(&host);
         }
@@ -252,6 +266,7 @@ impl Room {
 
     pub(crate) fn stop(&self) {
         self.stop.send_replace(true);
+        self.shadows.close();
     }
 
     pub(crate) fn stopped(&self) -> bool {
@@ -331,6 +346,7 @@ impl Room {
                 if record.faults_in_row > 0 {
                     self.look_for_fallback(&record);
                 }
+                self.keep_cycle(&record);
                 self.feed.pass(record);
             }
             DeployArrival::Bus(Arrival::Record(record)) => self.feed.pass(record),

@@ -5,12 +5,13 @@
 //! Never: trusts what it reads; every value that matters is checked where it is used.
 
 use bumpless_core::{Command, ComponentInfo, Digest, Edition, HostId, Intent, LoopId, LoopSpec, PointId, Record};
-use bumpless_store::Tombstone;
+use bumpless_store::{Tombstone, Window};
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
 use crate::{
     draft::{Change, LoopDraft},
     error::{Error, Words},
+    report::{CyclesView, ReplayReport, ShadowView, Trial, TrialReport},
     view::{ApplyEnd, CommandEnd, PointView, Stage},
 };
 
@@ -65,6 +66,14 @@ pub(crate) enum Ask {
     Intent(LoopId),
     /// The last records that the host has of these loops.
     Records(Vec<LoopId>),
+    /// To the home: recorded cycles, at most so many.
+    Cycles(LoopId, Window, u32),
+    /// To the home: recorded steps made again.
+    Replay(LoopId, Window),
+    /// To the home: a candidate on recorded cycles.
+    Backtest(LoopId, Box<Trial>, Window),
+    /// To the home: a candidate on the cycles to come.
+    Shadow(LoopId, ShadowAsk),
 }
 
 /// A change of a loop by a part.
@@ -76,6 +85,19 @@ pub(crate) enum Amend {
     Set(Change),
     /// An earlier revision; the one before where none is named.
     Rollback(Option<u64>),
+}
+
+/// What may be asked about shadows.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) enum ShadowAsk {
+    /// Begin one, for so many cycles.
+    Start(Box<Trial>, u64),
+    /// All of the loop.
+    List,
+    /// One, with its curves.
+    Show(u64),
+    /// End one that follows; forget one that has ended.
+    Stop(u64),
 }
 
 /// What a host may answer.
@@ -105,6 +127,14 @@ pub(crate) enum Told {
     Intent(Option<Box<Intent>>),
     /// Last records.
     Records(Vec<Record>),
+    /// Recorded cycles.
+    Cycles(Box<CyclesView>),
+    /// What a replay found.
+    Replayed(Box<ReplayReport>),
+    /// What a backtest found.
+    Tried(Box<TrialReport>),
+    /// Shadows.
+    Shadows(Vec<ShadowView>),
     /// A component's bytes. Never written by serde: see [`encode_reply`].
     #[serde(skip)]
     Bytes(Vec<u8>),

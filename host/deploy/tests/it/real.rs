@@ -7,30 +7,32 @@ use bumpless_core::{BusId, CommandBody, HostId, Record};
 use bumpless_deploy::{Change, Deploy, DeployArrival, Error, Parts};
 use bumpless_io::{Clock, IoServer};
 use bumpless_loops::{Loops, LoopsEvent};
-use bumpless_store::{RecordWriter, Store};
+use bumpless_store::{CycleLog, RecordWriter, Store};
 use parking_lot::Mutex;
 
 use crate::harness::{Cell, component, draft, engine, id, until};
 
 type Slot<T> = Arc<Mutex<Option<T>>>;
 
-struct Real {
-    deploy: Deploy,
-    loops: Loops,
+pub(crate) struct Real {
+    pub(crate) deploy: Deploy,
+    pub(crate) loops: Loops,
     session: Session,
     writer: Arc<RecordWriter>,
+    pub(crate) cycles: Arc<CycleLog>,
     slots: (Slot<Deploy>, Slot<Loops>),
     /// The first record that was taken.
     first: Slot<Arc<Record>>,
 }
 
 impl Real {
-    async fn stop(self) {
+    pub(crate) async fn stop(self) {
         let Self {
             deploy,
             loops,
             session,
             writer,
+            cycles,
             slots,
             first: _,
         } = self;
@@ -41,12 +43,13 @@ impl Real {
         *slots.0.lock() = None;
         *slots.1.lock() = None;
         drop((deploy, slots));
-        until("the disk is let go", || (Arc::strong_count(&writer) == 1).then_some(())).await;
+        let alone = || Arc::strong_count(&writer) == 1 && Arc::strong_count(&cycles) == 1;
+        until("the disk is let go", || alone().then_some(())).await;
     }
 }
 
 /// One host that serves points and runs controllers.
-async fn host(cell: &Cell, dir: &std::path::Path) -> Real {
+pub(crate) async fn host(cell: &Cell, dir: &std::path::Path) -> Real {
     let slot: Slot<Deploy> = Arc::default();
     let loops_slot: Slot<Loops> = Arc::default();
     let (deploy, loops) = (Arc::clone(&slot), Arc::clone(&loops_slot));
@@ -90,9 +93,11 @@ async fn host(cell: &Cell, dir: &std::path::Path) -> Real {
     *loops_slot.lock() = Some(loops.clone());
     let store = Store::open(dir).unwrap();
     let writer = Arc::new(RecordWriter::start(store.clone()).unwrap());
+    let cycles = Arc::new(CycleLog::open(&store, 16 * 1024 * 1024).unwrap());
     let deploy = Deploy::start(Parts {
         session: session.clone(),
         writer: Arc::clone(&writer),
+        cycles: Some(Arc::clone(&cycles)),
         store,
         engine,
         io: Some(io),
@@ -112,6 +117,7 @@ async fn host(cell: &Cell, dir: &std::path::Path) -> Real {
         loops,
         session,
         writer,
+        cycles,
         slots: (slot, loops_slot),
         first,
     }

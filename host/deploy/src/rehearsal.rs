@@ -1,0 +1,539 @@
+//! A candidate on recorded cycles: it sees what the loop's own controller saw, and moves nothing.
+//!
+//! Owns: the candidate's state from cycle to cycle, and the figures that make its report.
+//! Never: touches a point, runs on a cycle's thread, or claims more than it can: the plant was moved by the recorded
+//! controller, so a candidate that would have moved it elsewhere is seen only where it begins to.
+//!
+//! ```text
+//! nothing ──first record──► anchored ──next record: state by "same", migrate or start──► following ──► each record: step
+//!                              ▲                                                             │
+//!                              └────────────── a record is missing before this one ──────────┘
+//! ```
+
+use std::{collections::BTreeMap, sync::Arc};
+
+use bumpless_core::{
+    Cycle, Descriptor, Event, Fault, Frame, LoopId, LoopSpec, Reading, Record, Wiring, guard,
+    indices::{Indices, Rule, TotalVariation},
+    swap::{self, HandOver},
+};
+use bumpless_engine::{Instance, Origin};
+use bumpless_loops::HeldRevision;
+
+use crate::{
+    curve::Curve,
+    report::{CurvePoint, Finding, IndexReport, OutputReport, Skipped, StepTimes, TrialReport, Verdict},
+};
+
+/// Differences up to this, in % of span, count as none.
+const SAME_PERCENT: f64 = 0.01;
+
+/// Different reasons for leaving cycles out that are told apart; the rest is one.
+const REASONS_MAX: usize = 16;
+
+/// A revision that recorded cycles ran under.
+#[derive(Debug, Clone)]
+pub(crate) struct Known {
+    pub(crate) spec: Arc<LoopSpec>,
+    pub(crate) wiring: Arc<Wiring>,
+    pub(crate) descriptor: Arc<Descriptor>,
+}
+
+/// Finds a revision of the loop by its number.
+pub(crate) type Finder = Box<dyn Fn(u64) -> Option<Known> + Send>;
+
+/// What a trial is about.
+pub(crate) struct Candidate {
+    pub(crate) held: HeldRevision,
+    /// `name@version`.
+    pub(crate) title: String,
+    pub(crate) dropped_parameters: Vec<String>,
+    pub(crate) dropped_ports: Vec<String>,
+}
+
+/// Cycles that were left out, by reason.
+#[derive(Debug, Default)]
+pub(crate) struct Passed(BTreeMap<String, u64>);
+
+impl Passed {
+    pub(crate) fn note(&mut self, reason: &str) {
+        let known = self.0.contains_key(reason) || self.0.len() < REASONS_MAX;
+        let reason = if known { reason } else { "other reasons" };
+        *self.0.entry(reason.to_owned()).or_default() += 1;
+    }
+
+    pub(crate) fn told(&self) -> Vec<Skipped> {
+        let skipped = |(reason, cycles): (&String, &u64)| Skipped {
+            reason: reason.clone(),
+            cycles: *cycles,
+        };
+        self.0.iter().map(skipped).collect()
+    }
+}
+
+/// What the actuators hold, one value per output, with the safe value where that is not known.
+pub(crate) fn track(wiring: &Wiring, readings: &[Reading]) -> Vec<f64> {
+    let held = wiring.held(readings);
+    let known = |(value, limit): (&f64, &bumpless_core::OutputLimit)| {
+        if value.is_finite() { *value } else { limit.safe }
+    };
+    held.iter().zip(&wiring.limits).map(known).collect()
+}
+
+/// What the step of a recorded cycle saw.
+pub(crate) fn frame(record: &Record, readings: Vec<Reading>) -> Frame {
+    Frame {
+        cycle: Cycle {
+            seq: record.seq,
+            at_ns: record.at_ns,
+            dt_ns: record.dt_ns,
+            mode: record.mode,
+            setpoint: record.setpoint,
+        },
+        readings,
+        messages: record.heard.clone(),
+    }
+}
+
+/// Did the policy decide this cycle's output?
+pub(crate) fn held_by_policy(record: &Record) -> bool {
+    record.events.iter().any(|event| matches!(event, Event::PolicyHeld))
+}
+
+/// One output that both drive.
+#[derive(Debug, Default)]
+struct Pair {
+    /// Number among the candidate's outputs.
+    output: usize,
+    span: f64,
+    max_percent: f64,
+    max_at: (u64, u64),
+    sum: f64,
+    squares: f64,
+    recorded_travel: TotalVariation,
+    candidate_travel: TotalVariation,
+}
+
+/// A candidate on its way through recorded cycles.
+pub(crate) struct Rehearsal {
+    loop_id: LoopId,
+    candidate: Candidate,
+    find: Finder,
+    known: BTreeMap<u64, Option<Known>>,
+    last: Option<Arc<Record>>,
+    state: Option<Vec<u8>>,
+    wanted: Vec<f64>,
+    taken_over_by: Option<&'static str>,
+    anchored_anew: u64,
+    times_ns: (u64, u64),
+    cycles: u64,
+    compared: u64,
+    equal: u64,
+    held: u64,
+    faults: u64,
+    first_fault: Option<Finding>,
+    passed: Passed,
+    bump_percent: Option<f64>,
+    pairs: Vec<Pair>,
+    /// Of each good step, in ns; longer than 4 s counts as that.
+    steps_ns: Vec<u32>,
+    measured: Option<usize>,
+    indices: Indices,
+    curve: Curve,
+}
+
+impl Rehearsal {
+    /// A candidate that has seen nothing yet.
+    pub(crate) fn new(candidate: Candidate, find: Finder) -> Self {
+        let (wiring, descriptor) = (&candidate.held.wiring, &candidate.held.descriptor);
+        let connected = |output: &usize| {
+            let port = wiring.outputs.get(*output).copied().unwrap_or_default();
+            wiring.points.get(usize::from(port)).is_some_and(Option::is_some)
+        };
+        let pair = |output| Pair {
+            output,
+            span: wiring.span(output),
+            ..Pair::default()
+        };
+        Self {
+            loop_id: candidate.held.spec.id.clone(),
+            pairs: (0..wiring.outputs.len()).filter(connected).map(pair).collect(),
+            measured: crate::plan::measured_port(descriptor)
+                .and_then(|name| descriptor.ports.iter().position(|port| port.name == name)),
+            candidate,
+            find,
+            known: BTreeMap::new(),
+            last: None,
+            state: None,
+            wanted: Vec::new(),
+            taken_over_by: None,
+            anchored_anew: 0,
+            times_ns: (0, 0),
+            cycles: 0,
+            compared: 0,
+            equal: 0,
+            held: 0,
+            faults: 0,
+            first_fault: None,
+            passed: Passed::default(),
+            bump_percent: None,
+            steps_ns: Vec::new(),
+            indices: Indices::new(Rule::Rectangle),
+            curve: Curve::default(),
+        }
+    }
+
+    /// Cycles that the candidate saw.
+    pub(crate) const fn cycles(&self) -> u64 {
+        self.cycles
+    }
+
+    fn known(&mut self, record: &Record) -> Option<Known> {
+        let find = &self.find;
+        let known = self
+            .known
+            .entry(record.revision)
+            .or_insert_with(|| find(record.revision));
+        known.clone().filter(|known| known.spec.digest == record.digest)
+    }
+
+    /// Takes the next record. The first one, and the first after a gap, is only gone on from.
+    pub(crate) fn take(&mut self, record: &Arc<Record>) {
+        let before = self.last.replace(Arc::clone(record));
+        let Some(base) = before else { return };
+        if record.after != base.position() {
+            self.state = None;
+            self.anchored_anew += 1;
+            self.passed.note("the record before it is missing");
+            return;
+        }
+        let Some(recorded) = self.known(record) else {
+            self.state = None;
+            self.passed.note("its revision is no longer known");
+            return;
+        };
+        if self.times_ns.0 == 0 {
+            self.times_ns.0 = record.at_ns;
+        }
+        self.times_ns.1 = record.at_ns;
+        self.cycles += 1;
+        let readings = recorded.wiring.remap(&record.readings, &self.candidate.held.wiring);
+        let measurement = self
+            .measured
+            .and_then(|port| readings.get(port))
+            .map(Reading::value_or_last);
+        if let Some(measurement) = measurement {
+            // A clock that went back at a restart of the home: the index goes on after it.
+            let _ = self
+                .indices
+                .add(record.at_ns as f64 * 1e-9, record.setpoint, measurement);
+        }
+        if self.candidate.held.wiring.bad_input(&readings).is_some() {
+            self.held += 1;
+            return;
+        }
+        match self.step(&base, record, &recorded, readings) {
+            Ok(first) => self.compare(record, &recorded, measurement.unwrap_or(f64::NAN), first),
+            Err(fault) => {
+                self.faults += 1;
+                let text = fault.to_string();
+                let position = record.position();
+                self.first_fault.get_or_insert(Finding { position, text });
+            }
+        }
+    }
+
+    /// Steps the candidate. Says what the actuators held where this was the first step after a take-over.
+    fn step(
+        &mut self,
+        base: &Record,
+        record: &Record,
+        recorded: &Known,
+        readings: Vec<Reading>,
+    ) -> Result<Option<Vec<f64>>, Fault> {
+        let held = track(&self.candidate.held.wiring, &readings);
+        let (state, first) = match self.state.take() {
+            Some(state) => (state, false),
+            None => {
+                let origin = if base.revision == record.revision {
+                    Some(recorded.clone())
+                } else {
+                    self.known(base)
+                };
+                let (state, by) = take_over(&mut self.candidate.held, origin.as_ref(), &base.state, &held)?;
+                self.taken_over_by.get_or_insert(by);
+                self.wanted.clone_from(&held);
+                (state, true)
+            }
+        };
+        let candidate = &mut self.candidate.held;
+        let limit_ns = candidate.spec.step_limit_ns();
+        match candidate.instance.step(&frame(record, readings), &state, limit_ns) {
+            Ok(effects) => {
+                self.steps_ns
+                    .push(u32::try_from(candidate.instance.last_step_ns()).unwrap_or(u32::MAX));
+                self.wanted = candidate.wiring.wanted(&effects.writes, &self.wanted);
+                self.state = Some(effects.state);
+                Ok(first.then_some(held))
+            }
+            Err(fault) => {
+                // As in a loop: the state stays as it was before the fault.
+                self.state = Some(state);
+                Err(fault)
+            }
+        }
+    }
+
+    fn compare(&mut self, record: &Record, recorded: &Known, measurement: f64, first: Option<Vec<f64>>) {
+        let ours = &self.candidate.held.wiring;
+        let theirs = &recorded.wiring;
+        let point = |wiring: &Wiring, output: usize| {
+            let port = wiring.outputs.get(output)?;
+            wiring.points.get(usize::from(*port)).cloned().flatten()
+        };
+        let same = |output: usize| {
+            let wanted = point(ours, output)?;
+            (0..theirs.outputs.len()).find(|other| point(theirs, *other).as_ref() == Some(&wanted))
+        };
+        // Beyond the limits no difference reaches the actuator.
+        let through = |wiring: &Wiring, values: &[f64], output: usize| {
+            let (value, limit) = (values.get(output)?, wiring.limits.get(output)?);
+            Some(value.max(limit.low).min(limit.high))
+        };
+        if let Some(held) = first
+            && self.bump_percent.is_none()
+        {
+            let guarded = guard::guard(
+                record.mode,
+                &self.wanted,
+                &record.manual,
+                &held,
+                &ours.limits,
+                record.dt_ns,
+            );
+            let bumps = self.pairs.iter().filter_map(|pair| {
+                let (new, old) = (
+                    guarded.outputs.get(pair.output)?,
+                    record.outputs.get(same(pair.output)?)?,
+                );
+                Some(swap::bump_percent(&[*old], &[*new], &[pair.span]))
+            });
+            self.bump_percent = Some(bumps.fold(0.0, f64::max));
+        }
+        if held_by_policy(record) {
+            self.passed.note("the policy held the recorded output");
+            return;
+        }
+        let (mut recorded_now, mut candidate_now, mut equal) = (Vec::new(), Vec::new(), true);
+        let mut apart_percent: f64 = 0.0;
+        for pair in &mut self.pairs {
+            let theirs_now = same(pair.output).and_then(|other| through(theirs, &record.wanted, other));
+            let (Some(old), Some(new)) = (theirs_now, through(ours, &self.wanted, pair.output)) else {
+                recorded_now.push(f64::NAN);
+                candidate_now.push(f64::NAN);
+                equal = false;
+                continue;
+            };
+            let percent = swap::bump_percent(&[old], &[new], &[pair.span]);
+            equal &= old.to_bits() == new.to_bits();
+            apart_percent = apart_percent.max(percent);
+            if percent > pair.max_percent {
+                (pair.max_percent, pair.max_at) = (percent, record.position());
+            }
+            pair.sum += percent;
+            pair.squares += percent * percent;
+            pair.recorded_travel.add(old);
+            pair.candidate_travel.add(new);
+            recorded_now.push(old);
+            candidate_now.push(new);
+        }
+        self.compared += 1;
+        self.equal += u64::from(equal);
+        let point = CurvePoint {
+            at_ns: record.at_ns,
+            setpoint: record.setpoint,
+            measurement,
+            recorded: recorded_now,
+            candidate: candidate_now,
+        };
+        self.curve.add(point, apart_percent);
+    }
+
+    /// What was found so far.
+    pub(crate) fn report(&self) -> TrialReport {
+        let held = &self.candidate.held;
+        let port = |number: usize| held.descriptor.ports.get(number);
+        let n = (self.compared as f64).max(1.0);
+        let output = |pair: &Pair| {
+            let number = held.wiring.outputs.get(pair.output).copied().unwrap_or_default();
+            let face = port(usize::from(number));
+            OutputReport {
+                port: face.map_or_else(|| number.to_string(), |port| port.name.clone()),
+                unit: face.map(|port| port.unit.clone()).unwrap_or_default(),
+                span: pair.span,
+                max_percent: pair.max_percent,
+                max_at: pair.max_at,
+                mean_percent: pair.sum / n,
+                rms_percent: (pair.squares / n).sqrt(),
+                recorded_travel: pair.recorded_travel.value(),
+                candidate_travel: pair.candidate_travel.value(),
+            }
+        };
+        let mut report = TrialReport {
+            loop_id: self.loop_id.clone(),
+            component: self.candidate.title.clone(),
+            digest: held.spec.digest,
+            parameters: held.spec.parameters.clone(),
+            dropped_parameters: self.candidate.dropped_parameters.clone(),
+            dropped_ports: self.candidate.dropped_ports.clone(),
+            taken_over_by: self.taken_over_by.map(str::to_owned),
+            anchored_anew: self.anchored_anew,
+            from_ns: self.times_ns.0,
+            to_ns: self.times_ns.1,
+            cycles: self.cycles,
+            compared: self.compared,
+            equal: self.equal,
+            held: self.held,
+            faults: self.faults,
+            first_fault: self.first_fault.clone(),
+            skipped: self.passed.told(),
+            bump_percent: self.bump_percent,
+            bump_limit_percent: held.spec.policy.bump_limit_percent,
+            outputs: self.pairs.iter().map(output).collect(),
+            steps: times(&self.steps_ns),
+            indices: IndexReport {
+                duration_s: self.indices.duration_s(),
+                ie: self.indices.ie(),
+                iae: self.indices.iae(),
+                ise: self.indices.ise(),
+                itae: self.indices.itae(),
+                id_percent: self.indices.id_percent(),
+            },
+            verdict: None,
+            reason: String::new(),
+            measured_port: self.measured.and_then(port).map(|port| port.name.clone()),
+            measured_unit: self
+                .measured
+                .and_then(port)
+                .map(|port| port.unit.clone())
+                .unwrap_or_default(),
+            cycles_per_point: self.curve.cycles_per_point(),
+            points: self.curve.points(),
+            unread: 0,
+            stopped_early: None,
+        };
+        (report.verdict, report.reason) = judged(&report);
+        report
+    }
+}
+
+/// The candidate's first state, as a swap would make it.
+fn take_over(
+    held: &mut HeldRevision,
+    from: Option<&Known>,
+    state: &[u8],
+    track: &[f64],
+) -> Result<(Vec<u8>, &'static str), Fault> {
+    let limit_ns = held.spec.step_limit_ns();
+    let (instance, parameters): (&mut Instance, _) = (&mut held.instance, &held.wiring.parameters);
+    if let Some(from) = from.filter(|_| !state.is_empty()) {
+        if swap::hand_over(&from.spec, &held.spec) == HandOver::Same {
+            return Ok((state.to_vec(), "same"));
+        }
+        let origin = Origin {
+            name: from.descriptor.name.clone(),
+            version: from.descriptor.version.clone(),
+            state_layout: from.descriptor.state_layout,
+        };
+        if let Ok(state) = instance.migrate(&origin, state, parameters, track, limit_ns) {
+            return Ok((state, "migrate"));
+        }
+    }
+    instance
+        .start(parameters, track, limit_ns)
+        .map(|state| (state, "start"))
+}
+
+fn times(steps_ns: &[u32]) -> StepTimes {
+    let mut sorted = steps_ns.to_vec();
+    sorted.sort_unstable();
+    // The nearest rank: a time that really was.
+    let at = |part: f64| {
+        let rank = (sorted.len() as f64 * part).ceil() as usize;
+        sorted
+            .get(rank.saturating_sub(1))
+            .map_or(0.0, |ns| f64::from(*ns) / 1e3)
+    };
+    StepTimes {
+        p50_us: at(0.5),
+        p99_us: at(0.99),
+        worst_us: at(1.0),
+    }
+}
+
+/// The verdict and its reason. A fault weighs more than any likeness.
+fn judged(report: &TrialReport) -> (Option<Verdict>, String) {
+    let worst = report
+        .outputs
+        .iter()
+        .max_by(|a, b| a.max_percent.total_cmp(&b.max_percent));
+    if let Some(fault) = &report.first_fault {
+        let (term, seq) = fault.position;
+        let reason = format!(
+            "it faulted in {} of {} cycles, first in cycle {seq} of term {term}: {}",
+            report.faults, report.cycles, fault.text
+        );
+        return (Some(Verdict::Fails), reason);
+    }
+    let (Some(worst), 1..) = (worst, report.compared) else {
+        return (None, "no cycle could be compared".to_owned());
+    };
+    let limit = report.bump_limit_percent;
+    let (term, seq) = worst.max_at;
+    let (port, percent) = (&worst.port, worst.max_percent);
+    if report.equal == report.compared {
+        let reason = format!("all outputs of {} cycles are equal to the last bit", report.compared);
+        (Some(Verdict::Same), reason)
+    } else if percent <= SAME_PERCENT {
+        let reason = format!("no output is farther away than {percent:.2e} % of its span");
+        (Some(Verdict::Same), reason)
+    } else if percent <= limit {
+        let reason = format!(
+            "{port} is at most {percent:.3} % of its span away, in cycle {seq} of term {term}; a swap may step by {limit} %"
+        );
+        (Some(Verdict::Close), reason)
+    } else {
+        let reason = format!(
+            "{port} is up to {percent:.3} % of its span away, in cycle {seq} of term {term}; a swap may step by {limit} %"
+        );
+        (Some(Verdict::Differs), reason)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "tests")]
+
+    use super::*;
+
+    #[test]
+    fn times_are_ranks() {
+        assert_eq!(times(&[]), StepTimes::default());
+        let hundred: Vec<u32> = (1..=100).rev().map(|us| us * 1000).collect();
+        let told = times(&hundred);
+        assert_eq!((told.p50_us, told.p99_us, told.worst_us), (50.0, 99.0, 100.0));
+        assert_eq!(times(&[7_000]).p50_us, 7.0);
+    }
+
+    #[test]
+    fn reasons_are_counted_and_their_number_is_bounded() {
+        let mut passed = Passed::default();
+        for i in 0..100 {
+            passed.note(&format!("reason {}", i % 30));
+        }
+        let told = passed.told();
+        assert_eq!(told.len(), REASONS_MAX + 1);
+        assert_eq!(told.iter().map(|skipped| skipped.cycles).sum::<u64>(), 100);
+        assert!(told.iter().any(|skipped| skipped.reason == "other reasons"));
+    }
+}
