@@ -24,7 +24,7 @@ use crate::{
     report::{CyclesView, ReplayReport, ShadowView, Trial, TrialReport},
     room::{DeployArrival, Parts, Room},
     view::{
-        ApplyEnd, Call, CallEnd, CommandEnd, ComponentView, Counters, HostView, LoopView, PointView, Relabel,
+        ApplyEnd, Call, CallEnd, CommandEnd, ComponentView, Counters, HostView, Imported, LoopView, PointView, Relabel,
         StageView, Upload,
     },
     wire::{Amend, Ask, ShadowAsk, Told},
@@ -104,6 +104,24 @@ impl Deploy {
     /// [`Error::NotFound`] for the component or a label to remove, [`Error::Invalid`], [`Error::Store`].
     pub async fn relabel(&self, reference: &str, change: &Relabel) -> Result<ComponentInfo, Error> {
         self.room.relabel(reference, change).await.map(|info| (*info).clone())
+    }
+
+    /// A file with these components, for a plant without a network: an OCI image layout in a tar, at most 64 components and
+    /// 128 MiB.
+    ///
+    /// # Errors
+    /// [`Error::NotFound`] for a component or its bytes, [`Error::Invalid`] for too many.
+    pub async fn export(&self, references: &[String]) -> Result<Vec<u8>, Error> {
+        self.room.export(references).await
+    }
+
+    /// Takes in the components of such a file, each as by [`Deploy::take_in`]. One that is refused does not hold up the
+    /// others.
+    ///
+    /// # Errors
+    /// [`Error::Invalid`] where the file is no bundle.
+    pub async fn import(&self, bytes: Vec<u8>, by: &str, force: bool) -> Result<Vec<Imported>, Error> {
+        self.room.import(bytes, by, force).await
     }
 
     /// How far each host is with a component, by name. Every host is asked, and given two seconds.

@@ -24,6 +24,7 @@ mod answers;
 mod aside;
 mod bench;
 mod book;
+mod bundle;
 mod change;
 mod curve;
 mod deploy;
@@ -57,6 +58,6 @@ pub use error::{Error, Words};
 pub use field::{CallSink, CommandSink, Field, WithdrawSink};
 pub use room::{DeployArrival, Parts};
 pub use view::{
-    ApplyEnd, Call, CallEnd, CommandEnd, ComponentView, Counters, FailureView, HandOverView, HostView, LoopView,
-    PointView, Relabel, Stage, StageView, Upload,
+    ApplyEnd, Call, CallEnd, CommandEnd, ComponentView, Counters, FailureView, HandOverView, HostView, Imported,
+    LoopView, PointView, Relabel, Stage, StageView, Upload,
 };

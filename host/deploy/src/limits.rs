@@ -45,6 +45,18 @@ pub const TRIAL_STEP_LIMIT_NS: u64 = 1_000_000_000;
 /// Stack of a trial's thread: a guest may use 256 KiB, and a call needs 1 MiB in all.
 pub const TRIAL_STACK_BYTES: usize = 2 * 1024 * 1024;
 
+/// Bytes of a bundle: it is in memory whole while it is made or read.
+pub const BUNDLE_BYTES_MAX: usize = 128 * 1024 * 1024;
+
+/// Components of one bundle: each is compiled and tried when it is taken in.
+pub const BUNDLE_COMPONENTS_MAX: usize = 64;
+
+/// Bytes of a document in a bundle: a descriptor with all its texts has some 100 KB.
+pub const BUNDLE_DOCUMENT_BYTES_MAX: usize = 1024 * 1024;
+
+/// Files and folders in a bundle: three for each component, and as many again for what other tools add.
+pub const BUNDLE_ENTRIES_MAX: usize = 512;
+
 /// How long another host may take to say how far it is with a component: whoever asks looks again soon.
 pub const STAGE_WAIT: Duration = Duration::from_secs(2);
 

@@ -18,11 +18,12 @@ use crate::{
     admission::let_in,
     bench::{engine_error, stopping},
     book::on_disk,
+    bundle,
     error::Error,
     library::title,
-    limits::UPLOAD_WAIT,
+    limits::{BUNDLE_BYTES_MAX, BUNDLE_COMPONENTS_MAX, UPLOAD_WAIT},
     room::{Room, count, unix_ms},
-    view::{Relabel, Upload},
+    view::{Imported, Relabel, Upload},
     wire::Notice,
 };
 
@@ -227,6 +228,64 @@ impl Room {
         self.component_gone(info.digest, at_ms).await?;
         self.announce(&Notice::ComponentGone(info.digest, at_ms));
         Ok(())
+    }
+
+    /// A file with these components.
+    pub(crate) async fn export(self: &Arc<Self>, references: &[String]) -> Result<Vec<u8>, Error> {
+        let (mut infos, mut size) = (BTreeMap::new(), 0);
+        for reference in references.iter().take(BUNDLE_COMPONENTS_MAX + 1) {
+            let info = self.library.resolve(reference)?;
+            infos.insert((info.name.clone(), info.version.clone(), info.digest), info);
+        }
+        let mut components = Vec::new();
+        for info in infos.values() {
+            // Before the bytes are fetched, so that a long list does not fill the memory.
+            size += usize::try_from(info.bytes).unwrap_or(usize::MAX);
+            if size > BUNDLE_BYTES_MAX {
+                return Err(Error::invalid(
+                    format!("the components have more than {BUNDLE_BYTES_MAX} bytes in all"),
+                    "make several bundles",
+                ));
+            }
+            components.push(((**info).clone(), self.bytes_of(info.digest, None).await?));
+        }
+        on_disk(move || bundle::pack(components)).await?
+    }
+
+    /// Takes in what a file holds, one component after the other, each through its own trial.
+    pub(crate) async fn import(
+        self: &Arc<Self>,
+        bytes: Vec<u8>,
+        by: &str,
+        force: bool,
+    ) -> Result<Vec<Imported>, Error> {
+        check_words(by, "")?;
+        let entries = on_disk(move || bundle::unpack(&bytes)).await??;
+        let mut ends = Vec::with_capacity(entries.len());
+        for (name, parcel) in entries {
+            let (known, end) = match parcel {
+                Ok(parcel) => {
+                    let known = self.library.get(&parcel.digest).is_some();
+                    let upload = Upload {
+                        by: by.to_owned(),
+                        note: parcel.note,
+                        labels: parcel.labels,
+                        force,
+                    };
+                    (known, self.upload(parcel.bytes, &upload).await)
+                }
+                Err(error) => {
+                    count(&self.tallies.uploads_refused);
+                    (false, Err(error))
+                }
+            };
+            ends.push(Imported {
+                name,
+                end: end.map(|info| (*info).clone()),
+                known,
+            });
+        }
+        Ok(ends)
     }
 
     /// A component's bytes, from this host or another.

@@ -6,6 +6,8 @@ use bumpless_core::{
     Applied, ComponentInfo, Digest, HostId, LoopId, LoopSpec, Mode, PointId, Quality, Record, desk::Tally,
 };
 
+use crate::error::Error;
+
 /// A component and where it stands.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ComponentView {
@@ -39,6 +41,17 @@ pub struct Relabel {
     pub note: Option<String>,
     /// Labels to set, and to remove where there is no value.
     pub labels: BTreeMap<String, Option<String>>,
+}
+
+/// What became of one component of a bundle.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Imported {
+    /// What the bundle calls it.
+    pub name: String,
+    /// The component, or why it was not taken in.
+    pub end: Result<ComponentInfo, Error>,
+    /// Was it in the library before? Then nothing changed.
+    pub known: bool,
 }
 
 /// How far a host is with a component.

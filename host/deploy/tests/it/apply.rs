@@ -3,17 +3,14 @@
 use bumpless_core::OutputLimit;
 use bumpless_deploy::{Change, Error, LoopDraft};
 
-use crate::harness::{Cell, component, draft, id};
+use crate::harness::{Cell, component, draft, forced, id};
 
 #[tokio::test(flavor = "multi_thread")]
 async fn bad_drafts_are_refused_in_words_and_leave_nothing() {
     let cell = Cell::new();
     let io = cell.io("io", true).await;
     let pid = io.deploy.upload(component("pid"), "t", "").await.unwrap();
-    io.deploy
-        .upload(component("guests/fails-start"), "t", "")
-        .await
-        .unwrap();
+    forced(&io, "guests/fails-start").await;
     io.deploy.apply(draft("taken", "pid", "io", 9)).await.unwrap();
     let before = io.store.intents().unwrap();
     type Edit = fn(&mut LoopDraft);

@@ -7,7 +7,7 @@ use bumpless_deploy::{Change, Error};
 
 use crate::{
     field::Script,
-    harness::{Cell, Host, component, draft, id, until},
+    harness::{Cell, Host, component, draft, forced, id, until},
 };
 
 /// What the disk says: revision in force, pending, past.
@@ -130,10 +130,7 @@ async fn a_swap_keeps_what_fits_and_names_what_does_not() {
     assert!(view.component.starts_with("on-off@"), "{}", view.component);
     assert_eq!(view.spec.ports.len(), 2);
     // A component that cannot start is noticed before the loop hears of it.
-    io.deploy
-        .upload(component("guests/fails-start"), "t", "")
-        .await
-        .unwrap();
+    forced(&io, "guests/fails-start").await;
     let before = on_disk(&io, "l");
     let error = io
         .deploy

@@ -11,8 +11,8 @@ use std::{
 };
 
 use bumpless_cell::{Config, Roles, Session};
-use bumpless_core::{CellName, HostId, LoopId, Mode, Policy, Strategy};
-use bumpless_deploy::{Deploy, DeployArrival, LoopDraft, Parts};
+use bumpless_core::{CellName, ComponentInfo, HostId, LoopId, Mode, Policy, Strategy};
+use bumpless_deploy::{Deploy, DeployArrival, LoopDraft, Parts, Upload};
 use bumpless_engine::Engine;
 use bumpless_io::{Clock, IoServer};
 use bumpless_store::{RecordWriter, Store};
@@ -141,6 +141,8 @@ impl Cell {
             session: session.clone(),
             store: store.clone(),
             writer: Arc::clone(&writer),
+            // Its loops only write down what they are asked.
+            cycles: None,
             engine,
             roles: Roles {
                 io: io.is_some(),
@@ -215,6 +217,16 @@ pub(crate) async fn until<T>(what: &str, mut look: impl FnMut() -> Option<T>) ->
     }
 }
 
+/// Takes in a component that misbehaves, by force.
+pub(crate) async fn forced(host: &Host, name: &str) -> ComponentInfo {
+    let upload = Upload {
+        by: "t".to_owned(),
+        force: true,
+        ..Upload::default()
+    };
+    host.deploy.take_in(component(name), &upload).await.expect(name)
+}
+
 /// A loop on the points of `io`.
 pub(crate) fn draft(name: &str, component: &str, io: &str, number: u32) -> LoopDraft {
     LoopDraft {
@@ -233,6 +245,7 @@ pub(crate) fn draft(name: &str, component: &str, io: &str, number: u32) -> LoopD
         replicas: 3,
         limits: BTreeMap::new(),
         listens: Vec::new(),
+        fallback: None,
         policy: Policy::default(),
     }
 }

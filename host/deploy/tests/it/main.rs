@@ -10,12 +10,15 @@
     reason = "tests"
 )]
 
+mod admission;
 mod apply;
 mod change;
 mod distribution;
 mod field;
 mod harness;
+mod library;
 mod lifetime;
 mod orders;
 mod real;
+mod trials;
 mod uploads;
