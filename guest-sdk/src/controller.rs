@@ -135,4 +135,31 @@ impl<'a> Origin<'a> {
             ))
         }
     }
+
+    /// The parameters and the typed state, where this component or another wrote them in the given layout; none where the
+    /// origin is something else. One call per layout that is still out there makes an `adopt` that knows its past:
+    ///
+    /// ```
+    /// # use bumpless_sdk::prelude::*;
+    /// # use serde::{Deserialize, Serialize};
+    /// #[derive(Deserialize)]
+    /// struct Layout1 { sum: f64, cycles: u32 }
+    /// #[derive(Serialize, Deserialize)]
+    /// struct Layout2 { sum: f64, filtered: Option<f64> }
+    ///
+    /// fn adopt(from: &Origin<'_>) -> Result<Option<Layout2>, Fault> {
+    ///     // `cycles` was dropped, `filtered` is new: it starts with the next measurement.
+    ///     let known = from.state_of::<Layout1>("level", 1)?;
+    ///     Ok(known.map(|(_, old)| Layout2 { sum: old.sum, filtered: None }))
+    /// }
+    /// ```
+    ///
+    /// Fails with [`Fault::BadState`] where the bytes are not what the origin says.
+    pub fn state_of<T: DeserializeOwned>(&self, name: &str, layout: u32) -> Result<Option<(Parameters<'a>, T)>, Fault> {
+        if self.name != name || self.state_layout != layout {
+            return Ok(None);
+        }
+        let envelope = self.open()?;
+        Ok(Some((envelope.parameters, envelope.law()?)))
+    }
 }
