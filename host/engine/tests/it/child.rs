@@ -23,7 +23,12 @@ fn child_entry() {
     std::process::exit(0);
 }
 
-fn engine_with(dir: &tempfile::TempDir, instances_max: u32, limits: Limits, compile: Compile) -> Result<Engine, Error> {
+pub(crate) fn engine_with(
+    dir: &tempfile::TempDir,
+    instances_max: u32,
+    limits: Limits,
+    compile: Compile,
+) -> Result<Engine, Error> {
     Engine::new(Config {
         cache_dir: Some(dir.path().into()),
         instances_max,
@@ -33,7 +38,7 @@ fn engine_with(dir: &tempfile::TempDir, instances_max: u32, limits: Limits, comp
     })
 }
 
-fn this_binary() -> Compile {
+pub(crate) fn this_binary() -> Compile {
     let args = ["--exact", "child::child_entry", "--nocapture", "--test-threads=1", "-q"];
     Compile::Child {
         program: std::env::current_exe().unwrap(),
@@ -42,7 +47,7 @@ fn this_binary() -> Compile {
 }
 
 /// What is left in the folder besides compiled code.
-fn leftovers(dir: &tempfile::TempDir) -> usize {
+pub(crate) fn leftovers(dir: &tempfile::TempDir) -> usize {
     let names = std::fs::read_dir(dir.path()).unwrap().map(|e| e.unwrap().path());
     names.filter(|p| p.extension().is_none_or(|x| x != "cwasm")).count()
 }
@@ -82,14 +87,14 @@ fn a_child_says_why_it_refuses() {
 #[test]
 fn a_child_out_of_memory_is_named_as_such() {
     let dir = tempfile::tempdir().unwrap();
-    // Less than the program itself takes: whatever it asks for next is refused.
+    // About what the program itself takes: what a component of some size needs besides is refused.
     let limits = Limits {
         compile_memory_bytes_max: 32 * 1024 * 1024,
         ..Limits::default()
     };
     let error = engine_with(&dir, 1, limits, this_binary())
         .unwrap()
-        .inspect(&Guest::good().build())
+        .inspect(&crate::bombs::many_functions(20_000))
         .unwrap_err();
     assert_eq!(
         error.to_string(),
