@@ -56,6 +56,7 @@ const ROOMS: [(&str, &[&str]); 15] = [
     ("bumpless-pid", &["bumpless-isa", "bumpless-sdk"]),
     ("bumpless-pidplus", &["bumpless-isa", "bumpless-sdk"]),
     ("bumpless-on-off", &["bumpless-sdk"]),
+    ("bumpless-cascade", &["bumpless-isa", "bumpless-sdk"]),
     ("xtask", &["bumpless-core"]),
 ];
 

@@ -33,6 +33,24 @@ use crate::{
 struct Dropped {
     parameters: Vec<String>,
     ports: Vec<String>,
+    notes: Vec<String>,
+}
+
+impl Dropped {
+    fn of(swapped: plan::Swapped) -> (LoopSpec, Self) {
+        let plan::Swapped {
+            spec,
+            parameters,
+            ports,
+            notes,
+        } = swapped;
+        let dropped = Self {
+            parameters,
+            ports,
+            notes,
+        };
+        (spec, dropped)
+    }
 }
 
 /// How the members answered.
@@ -124,13 +142,7 @@ impl Room {
                         old.as_ref().map(|i| &i.descriptor),
                         &info.descriptor,
                     );
-                    (
-                        swapped.spec,
-                        Dropped {
-                            parameters: swapped.parameters,
-                            ports: swapped.ports,
-                        },
-                    )
+                    Dropped::of(swapped)
                 }
                 Amend::Set(change) => (plan::set(current, &change), Dropped::default()),
                 Amend::Rollback(revision) => {
@@ -293,12 +305,9 @@ impl Room {
                 let new = room.info_of(digest, None).await?;
                 let old = room.info_of(current.digest, None).await.ok();
                 let swapped = plan::fall_back(&current, digest, old.as_ref().map(|i| &i.descriptor), &new.descriptor);
+                let (spec, dropped) = Dropped::of(swapped);
                 let facts = |point: &_| room.point_facts(point, &id);
-                let spec = plan::complete(swapped.spec, &new.descriptor, &room.ground(&facts))?;
-                let dropped = Dropped {
-                    parameters: swapped.parameters,
-                    ports: swapped.ports,
-                };
+                let spec = plan::complete(spec, &new.descriptor, &room.ground(&facts))?;
                 room.change(intent, spec, &new, dropped).await
             });
             match end.await {
@@ -392,7 +401,8 @@ impl Room {
         // What ran before within this limit may always be gone back to, and so may what was chosen for the worst case.
         let ran = |past: &LoopSpec| past.digest == spec.digest && past.step_limit_ns() == spec.step_limit_ns();
         let known = intent.revisions().any(ran) || current.fallback == Some(spec.digest);
-        let warnings = step_warnings(info, &spec, known)?;
+        let mut warnings = step_warnings(info, &spec, known)?;
+        warnings.extend(dropped.notes.iter().cloned());
         let end = |revision, unchanged, hand_over| ApplyEnd {
             id: id.clone(),
             revision,

@@ -221,33 +221,73 @@ pub(crate) struct Swapped {
     pub(crate) spec: LoopSpec,
     pub(crate) parameters: Vec<String>,
     pub(crate) ports: Vec<String>,
+    /// For people: what did not come over, and why.
+    pub(crate) notes: Vec<String>,
 }
 
-/// Keeps what the new component has by the same name: parameters whose value is in its range, and ports. An input that it
-/// does not have is disconnected; an output is not, for its actuator would be left alone, so the check refuses it.
+/// Why a parameter does not come over; none where it does. The same name with another unit is another quantity: a reset time
+/// of 3 minutes is none of 3 seconds.
+fn left_out(name: &str, value: f64, old: Option<&Descriptor>, new: &Descriptor) -> Option<String> {
+    let of = |descriptor: &Descriptor| descriptor.parameters.iter().find(|p| p.name == name).cloned();
+    let before = old.and_then(of);
+    let unit = before.as_ref().map_or("", |p| p.unit.as_str());
+    let said = if unit.is_empty() {
+        format!("parameter {name} = {value} was left out:")
+    } else {
+        format!("parameter {name} = {value} {unit} was left out:")
+    };
+    let Some(after) = of(new) else {
+        return Some(format!("{said} {} has none of this name", new.name));
+    };
+    if before.is_some_and(|p| p.unit != after.unit) {
+        return Some(format!(
+            "{said} {} has it in {:?}; it begins with {}",
+            new.name, after.unit, after.default
+        ));
+    }
+    let (low, high) = (after.minimum, after.maximum);
+    (!(low..=high).contains(&value)).then(|| {
+        format!(
+            "{said} {} allows {low} to {high}; it begins with {}",
+            new.name, after.default
+        )
+    })
+}
+
+/// Keeps what the new component has by the same name: parameters of the same unit whose value is in its range, and ports. An
+/// input that it does not have is disconnected; an output is not, for its actuator would be left alone, so the check refuses
+/// it.
 pub(crate) fn swap(current: &LoopSpec, digest: Digest, old: Option<&Descriptor>, new: &Descriptor) -> Swapped {
     let mut spec = current.clone();
     spec.digest = digest;
-    let (kept, dropped): (BTreeMap<_, _>, BTreeMap<_, _>) = spec.parameters.into_iter().partition(|(name, value)| {
-        new.parameters
-            .iter()
-            .any(|p| p.name == *name && (p.minimum..=p.maximum).contains(value))
-    });
-    spec.parameters = kept;
-    let mut ports = Vec::new();
+    let (mut parameters, mut ports, mut notes) = (Vec::new(), Vec::new(), Vec::new());
+    spec.parameters
+        .retain(|name, value| match left_out(name, *value, old, new) {
+            Some(note) => {
+                parameters.push(name.clone());
+                notes.push(note);
+                false
+            }
+            None => true,
+        });
     spec.ports.retain(|name, _| {
         let keep = new.port(name).is_some() || current.limits.contains_key(name);
         // A port that neither component knows is for the check to complain about.
         let keep = keep || old.is_some_and(|old| old.port(name).is_none());
         if !keep {
             ports.push(name.clone());
+            notes.push(format!(
+                "port {name} was disconnected: {} has none of this name",
+                new.name
+            ));
         }
         keep
     });
     Swapped {
         spec,
-        parameters: dropped.into_keys().collect(),
+        parameters,
         ports,
+        notes,
     }
 }
 
