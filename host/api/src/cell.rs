@@ -6,8 +6,12 @@ use std::{future::Future, pin::Pin, sync::Arc};
 
 use bumpless_core::{CommandBody, CommandId, ComponentInfo, Digest, HostId, LoopId, Record};
 use bumpless_deploy::{
-    ApplyEnd, Call, CallEnd, Change, CommandEnd, ComponentView, Counters, Deploy, Error, HostView, LoopDraft, LoopView,
-    PointView,
+    ApplyEnd, Call, CallEnd, Change, CommandEnd, ComponentView, Counters, Deploy, Error, HostView, Imported, LoopDraft,
+    LoopView, PointView, Relabel, StageView, Upload,
+};
+use bumpless_deploy::{
+    Window,
+    report::{CyclesView, ReplayReport, ShadowView, Trial, TrialReport},
 };
 use tokio::sync::broadcast;
 
@@ -16,7 +20,12 @@ pub(crate) type Answer<T> = Pin<Box<dyn Future<Output = Result<T, Error>> + Send
 
 /// One host's part in the cell; see [`Deploy`] for what each method means.
 pub(crate) trait Cell: Send + Sync + 'static {
-    fn upload(&self, bytes: Vec<u8>, by: String, note: String) -> Answer<ComponentInfo>;
+    fn upload(&self, bytes: Vec<u8>, upload: Upload) -> Answer<ComponentInfo>;
+    fn try_out(&self, bytes: Vec<u8>, upload: Upload) -> Answer<ComponentInfo>;
+    fn relabel(&self, reference: String, change: Relabel) -> Answer<ComponentInfo>;
+    fn stages(&self, digest: Digest) -> Answer<Vec<StageView>>;
+    fn export(&self, references: Vec<String>) -> Answer<Vec<u8>>;
+    fn import(&self, bytes: Vec<u8>, by: String, force: bool) -> Answer<Vec<Imported>>;
     fn components(&self) -> Vec<ComponentView>;
     fn resolve(&self, reference: &str) -> Result<ComponentInfo, Error>;
     fn component_bytes(&self, digest: Digest) -> Answer<Vec<u8>>;
@@ -30,6 +39,13 @@ pub(crate) trait Cell: Send + Sync + 'static {
     fn rollback(&self, id: LoopId, revision: Option<u64>) -> Answer<ApplyEnd>;
     fn delete(&self, id: LoopId) -> Answer<()>;
     fn move_owner(&self, id: LoopId, to: HostId) -> Answer<()>;
+    fn cycles(&self, id: LoopId, window: Window, max: u32) -> Answer<CyclesView>;
+    fn replay(&self, id: LoopId, window: Window) -> Answer<ReplayReport>;
+    fn backtest(&self, id: LoopId, trial: Trial, window: Window) -> Answer<TrialReport>;
+    fn start_shadow(&self, id: LoopId, trial: Trial, cycles: u64) -> Answer<ShadowView>;
+    fn shadows(&self, id: LoopId) -> Answer<Vec<ShadowView>>;
+    fn show_shadow(&self, id: LoopId, shadow: u64) -> Answer<ShadowView>;
+    fn stop_shadow(&self, id: LoopId, shadow: u64) -> Answer<ShadowView>;
     fn hosts(&self) -> Vec<HostView>;
     fn here(&self) -> HostId;
     fn points(&self) -> Answer<Vec<PointView>>;
@@ -39,9 +55,34 @@ pub(crate) trait Cell: Send + Sync + 'static {
 }
 
 impl Cell for Deploy {
-    fn upload(&self, bytes: Vec<u8>, by: String, note: String) -> Answer<ComponentInfo> {
+    fn upload(&self, bytes: Vec<u8>, upload: Upload) -> Answer<ComponentInfo> {
         let deploy = self.clone();
-        Box::pin(async move { deploy.upload(bytes, &by, &note).await })
+        Box::pin(async move { deploy.take_in(bytes, &upload).await })
+    }
+
+    fn try_out(&self, bytes: Vec<u8>, upload: Upload) -> Answer<ComponentInfo> {
+        let deploy = self.clone();
+        Box::pin(async move { deploy.try_out(bytes, &upload).await })
+    }
+
+    fn relabel(&self, reference: String, change: Relabel) -> Answer<ComponentInfo> {
+        let deploy = self.clone();
+        Box::pin(async move { deploy.relabel(&reference, &change).await })
+    }
+
+    fn stages(&self, digest: Digest) -> Answer<Vec<StageView>> {
+        let deploy = self.clone();
+        Box::pin(async move { Ok(deploy.stages(digest).await) })
+    }
+
+    fn export(&self, references: Vec<String>) -> Answer<Vec<u8>> {
+        let deploy = self.clone();
+        Box::pin(async move { deploy.export(&references).await })
+    }
+
+    fn import(&self, bytes: Vec<u8>, by: String, force: bool) -> Answer<Vec<Imported>> {
+        let deploy = self.clone();
+        Box::pin(async move { deploy.import(bytes, &by, force).await })
     }
 
     fn components(&self) -> Vec<ComponentView> {
@@ -103,6 +144,41 @@ impl Cell for Deploy {
     fn move_owner(&self, id: LoopId, to: HostId) -> Answer<()> {
         let deploy = self.clone();
         Box::pin(async move { deploy.move_owner(&id, &to).await })
+    }
+
+    fn cycles(&self, id: LoopId, window: Window, max: u32) -> Answer<CyclesView> {
+        let deploy = self.clone();
+        Box::pin(async move { deploy.cycles(&id, window, max).await })
+    }
+
+    fn replay(&self, id: LoopId, window: Window) -> Answer<ReplayReport> {
+        let deploy = self.clone();
+        Box::pin(async move { deploy.replay(&id, window).await })
+    }
+
+    fn backtest(&self, id: LoopId, trial: Trial, window: Window) -> Answer<TrialReport> {
+        let deploy = self.clone();
+        Box::pin(async move { deploy.backtest(&id, trial, window).await })
+    }
+
+    fn start_shadow(&self, id: LoopId, trial: Trial, cycles: u64) -> Answer<ShadowView> {
+        let deploy = self.clone();
+        Box::pin(async move { deploy.start_shadow(&id, trial, cycles).await })
+    }
+
+    fn shadows(&self, id: LoopId) -> Answer<Vec<ShadowView>> {
+        let deploy = self.clone();
+        Box::pin(async move { deploy.shadows(&id).await })
+    }
+
+    fn show_shadow(&self, id: LoopId, shadow: u64) -> Answer<ShadowView> {
+        let deploy = self.clone();
+        Box::pin(async move { deploy.show_shadow(&id, shadow).await })
+    }
+
+    fn stop_shadow(&self, id: LoopId, shadow: u64) -> Answer<ShadowView> {
+        let deploy = self.clone();
+        Box::pin(async move { deploy.stop_shadow(&id, shadow).await })
     }
 
     fn hosts(&self) -> Vec<HostView> {

@@ -33,8 +33,11 @@ pub const CALL_TIME_MAX: Duration = Duration::from_secs(5);
 /// to come back.
 pub const CHANGE_TIME_MAX: Duration = Duration::from_secs(40);
 
-/// Longest time of an upload: a slow line, then at most 60 s in the compiler.
-pub const UPLOAD_TIME_MAX: Duration = Duration::from_secs(150);
+/// Longest time of an upload: a slow line, then at most 60 s in the compiler and 30 s of a trial, with others before it.
+pub const UPLOAD_TIME_MAX: Duration = Duration::from_secs(240);
+
+/// Longest time of a bundle: 64 components, each compiled and tried.
+pub const BUNDLE_TIME_MAX: Duration = Duration::from_secs(900);
 
 /// Time that connections get to finish once the host stops.
 pub const STOP_TIME_MAX: Duration = Duration::from_secs(3);
@@ -47,6 +50,9 @@ pub const HOSTS_EVERY: Duration = Duration::from_secs(1);
 
 /// Loops of one feed's filter.
 pub const FEED_LOOPS_MAX: usize = 64;
+
+/// Recorded cycles of one answer, where the asker says nothing.
+pub const CYCLES_DEFAULT: u64 = 100;
 
 /// Loops of one answer of the list, where the asker names no number.
 pub const PAGE_DEFAULT: usize = 1_000;

@@ -4,7 +4,7 @@ use utoipa::OpenApi;
 
 use crate::{
     error::Problem,
-    routes::{components, hosts, live, loops, pages},
+    routes::{bundle, components, history, hosts, live, loops, pages},
     types,
 };
 
@@ -16,9 +16,12 @@ use crate::{
                        command, watch. Every host answers for the whole cell. Errors are problem+json (RFC 9457)."
     ),
     paths(
-        components::list, components::upload, components::show, components::bytes, components::remove, components::call,
+        components::list, components::upload, components::show, components::bytes, components::relabel, components::remove, components::call,
+        bundle::export, bundle::import,
         loops::list, loops::show, loops::apply, loops::remove, loops::set, loops::swap, loops::rollback, loops::move_owner,
         loops::setpoint, loops::mode, loops::output,
+        history::cycles, history::replay, history::backtest,
+        history::start_shadow, history::shadows, history::show_shadow, history::stop_shadow,
         hosts::list, hosts::points, live::feed,
         pages::healthz, pages::readyz, pages::metrics, pages::openapi,
     ),
@@ -27,6 +30,7 @@ use crate::{
         (name = "components", description = "The library of control components"),
         (name = "loops", description = "Controllers bound to points"),
         (name = "commands", description = "What an operator asks of a running loop; answered when a committed record holds it"),
+        (name = "history", description = "Looking back: recorded cycles, replays, and candidates tried on them or beside a running loop"),
         (name = "cell", description = "Hosts, points and the live feed"),
         (name = "operation", description = "For supervisors and monitoring"),
     )

@@ -2,7 +2,9 @@
 //!
 //! Never: decides; what may be done is the cell's to say.
 
+pub(crate) mod bundle;
 pub(crate) mod components;
+pub(crate) mod history;
 pub(crate) mod hosts;
 pub(crate) mod live;
 pub(crate) mod loops;
@@ -21,8 +23,11 @@ pub(crate) fn all() -> Router<App> {
         .route("/v1/components", get(components::list).post(components::upload))
         .route(
             "/v1/components/{reference}",
-            get(components::show).delete(components::remove),
+            get(components::show)
+                .patch(components::relabel)
+                .delete(components::remove),
         )
+        .route("/v1/bundle", get(bundle::export).post(bundle::import))
         .route("/v1/components/{reference}/bytes", get(components::bytes))
         .route("/v1/components/{reference}/call", post(components::call))
         .route("/v1/loops", get(loops::list))
@@ -37,6 +42,17 @@ pub(crate) fn all() -> Router<App> {
         .route("/v1/loops/{name}/swap", post(loops::swap))
         .route("/v1/loops/{name}/rollback", post(loops::rollback))
         .route("/v1/loops/{name}/move", post(loops::move_owner))
+        .route("/v1/loops/{name}/cycles", get(history::cycles))
+        .route("/v1/loops/{name}/replay", post(history::replay))
+        .route("/v1/loops/{name}/backtest", post(history::backtest))
+        .route(
+            "/v1/loops/{name}/shadows",
+            get(history::shadows).post(history::start_shadow),
+        )
+        .route(
+            "/v1/loops/{name}/shadows/{id}",
+            get(history::show_shadow).delete(history::stop_shadow),
+        )
         .route("/v1/hosts", get(hosts::list))
         .route("/v1/points", get(hosts::points))
         .route("/v1/live", get(live::feed))

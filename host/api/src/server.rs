@@ -32,8 +32,8 @@ use crate::{
     error::{Error, Kind, Problem},
     gate::Gate,
     limits::{
-        CALL_TIME_MAX, CHANGE_TIME_MAX, FEEDS_MAX, PORT_TABLES_MAX, REQUEST_TIME_MAX, REQUESTS_MAX, STOP_TIME_MAX,
-        UPLOAD_TIME_MAX, UPLOADS_MAX,
+        BUNDLE_TIME_MAX, CALL_TIME_MAX, CHANGE_TIME_MAX, FEEDS_MAX, PORT_TABLES_MAX, REQUEST_TIME_MAX, REQUESTS_MAX,
+        STOP_TIME_MAX, UPLOAD_TIME_MAX, UPLOADS_MAX,
     },
     metrics::Metrics,
     routes,
@@ -198,6 +198,7 @@ pub(crate) fn router(app: App) -> Router {
 fn time_max(method: &Method, path: &str) -> Duration {
     match (method.as_str(), path) {
         ("POST", "/v1/components") => UPLOAD_TIME_MAX,
+        (_, "/v1/bundle") => BUNDLE_TIME_MAX,
         ("POST", "/v1/components/{reference}/call") => CALL_TIME_MAX,
         ("PUT", "/v1/loops/{name}")
         | ("POST", "/v1/loops/{name}/swap" | "/v1/loops/{name}/set" | "/v1/loops/{name}/rollback") => CHANGE_TIME_MAX,
@@ -262,6 +263,7 @@ fn known(method: &Method) -> &'static str {
         "HEAD" => "HEAD",
         "POST" => "POST",
         "PUT" => "PUT",
+        "PATCH" => "PATCH",
         "DELETE" => "DELETE",
         _ => "other",
     }

@@ -4,6 +4,8 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "tests")]
 
 mod fake;
+mod history;
+mod library;
 
 use std::sync::{Arc, atomic::Ordering};
 
@@ -13,7 +15,7 @@ use axum::{
     http::{Request, StatusCode, header},
 };
 use bumpless_core::{CommandBody, CommandId, Mode, Outcome, limits::COMPONENT_BYTES_MAX};
-use bumpless_deploy::{Error as DeployError, Words};
+use bumpless_deploy::{Error as DeployError, Upload, Words};
 use fake::Fake;
 use futures_util::StreamExt as _;
 use serde_json::{Value, json};
@@ -192,6 +194,39 @@ async fn what_cannot_be_read_is_a_problem_that_says_why() {
             "x-note is longer than 512",
         ),
         (get("/v1/components/none"), 404, "not-found", "no component"),
+        (get("/v1/components?lable=x"), 400, "bad-request", "lable"),
+        (
+            raw("POST", "/v1/components?labels=stage", "application/wasm", "wasm"),
+            422,
+            "invalid",
+            "label \"stage\" has no value",
+        ),
+        (
+            raw("POST", "/v1/components?labels=a=1,a=2", "application/wasm", "wasm"),
+            422,
+            "invalid",
+            "label \"a=2\" is given twice",
+        ),
+        (
+            send("PATCH", "/v1/components/pid", &json!({"label": {}})),
+            422,
+            "invalid",
+            "unknown field `label`",
+        ),
+        (
+            send("PATCH", "/v1/components/pid", &json!({"note": "a\nb"})),
+            422,
+            "invalid",
+            "control characters",
+        ),
+        (get("/v1/bundle"), 400, "bad-request", "components"),
+        (get("/v1/bundle?components=,"), 422, "invalid", "no component is named"),
+        (
+            raw("POST", "/v1/bundle", "application/wasm", "x"),
+            415,
+            "content-type",
+            "application/wasm",
+        ),
         (
             send("POST", "/v1/components/pid/call", &fake::call(0.0)),
             422,
@@ -346,10 +381,12 @@ async fn components_go_up_and_come_down() {
             .starts_with("/v1/components/")
     );
     let uploads = bench.cell.uploads.lock().unwrap().clone();
-    assert_eq!(
-        uploads,
-        [(b"wasm bytes".to_vec(), "api".to_owned(), "for pümps".to_owned())]
-    );
+    let upload = Upload {
+        by: "api".to_owned(),
+        note: "for pümps".to_owned(),
+        ..Upload::default()
+    };
+    assert_eq!(uploads, [(b"wasm bytes".to_vec(), upload)]);
     let response = bench.ask(get("/v1/components/pid/bytes")).await;
     assert_eq!(response.headers()[header::CONTENT_TYPE], "application/wasm");
     assert_eq!(

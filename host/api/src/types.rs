@@ -7,14 +7,21 @@
 
 mod call;
 mod component;
+mod history;
 mod hosts;
+mod library;
 mod loops;
 mod record;
 mod words;
 
 pub use call::{CallAnswer, CallRequest};
 pub use component::{Component, Components, Parameter, Port};
+pub use history::{
+    BacktestRequest, CurvePoint, CycleFinding, Cycles, LoopIndices, OutputTrial, Replay, ReplayRequest, Shadow,
+    ShadowRequest, Shadows, Skipped, StepTimes, Trial, TrialVerdict,
+};
 pub use hosts::{Host, Hosts, Point, Points};
+pub use library::{Admission, AdmissionFinding, ComponentEvent, ComponentHost, Import, Imports, RelabelRequest};
 pub use loops::{
     Apply, Command, Failure, HandOver, Loop, LoopDraft, Loops, ModeRequest, MoveRequest, OutputLimit, OutputRequest,
     Policy, RollbackRequest, SetRequest, SetpointRequest, SwapRequest, Tally,
@@ -22,6 +29,7 @@ pub use loops::{
 pub use record::{Alarm, Applied, Event, LogLine, Message, Reading, Record};
 pub use words::{Direction, LogLevel, Mode, OnBump, OnFault, PortKind, Priority, Quality, Strategy};
 
+pub(crate) use history::window;
 pub(crate) use loops::Depth;
 pub(crate) use record::{PortTable, PortTables};
 

@@ -1,5 +1,7 @@
 //! `/v1/components`: the library, and calls to its components.
 
+use std::collections::BTreeMap;
+
 use axum::{
     Json as JsonAnswer,
     body::Body,
@@ -8,7 +10,7 @@ use axum::{
     response::{IntoResponse as _, Response},
 };
 use bumpless_core::{ComponentInfo, limits::COMPONENT_BYTES_MAX};
-use bumpless_deploy::ComponentView;
+use bumpless_deploy::{ComponentView, Relabel, Upload};
 use serde::Deserialize;
 use utoipa::IntoParams;
 
@@ -16,7 +18,7 @@ use crate::{
     error::{Kind, Problem},
     extract::{InPath, InQuery, Json, body_bytes, content_type, words},
     server::{App, finish},
-    types::{CallAnswer, CallRequest, Component, Components},
+    types::{CallAnswer, CallRequest, Component, Components, RelabelRequest},
 };
 
 /// The component with where it stands.
@@ -26,21 +28,55 @@ fn seen(app: &App, info: ComponentInfo) -> Component {
         .components()
         .into_iter()
         .find(|view| view.info.digest == info.digest);
-    known
-        .unwrap_or_else(|| ComponentView {
-            info,
-            used_by: Vec::new(),
-            ready_on: Vec::new(),
-        })
-        .into()
+    let (used_by, ready_on) = known.map(|view| (view.used_by, view.ready_on)).unwrap_or_default();
+    ComponentView {
+        info,
+        used_by,
+        ready_on,
+    }
+    .into()
+}
+
+/// Which components are listed; all of what is given must hold.
+#[derive(Debug, Default, Deserialize, IntoParams)]
+#[into_params(parameter_in = Query)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct ListQuery {
+    /// Labels, separated by commas: `key=value`, or `key` for any value.
+    label: Option<String>,
+    /// The algorithm's name.
+    name: Option<String>,
+    /// A part of name, description, note, labels or uploader, in any case of letters.
+    text: Option<String>,
+}
+
+impl ListQuery {
+    fn takes(&self, info: &ComponentInfo) -> bool {
+        let labels = self.label.as_deref().unwrap_or_default();
+        let mut labels = labels.split(',').map(str::trim).filter(|label| !label.is_empty());
+        let text = self.text.as_deref().unwrap_or_default().to_lowercase();
+        let written = || {
+            let own = [&info.name, &info.descriptor.text, &info.note, &info.uploaded_by];
+            let labels = info.labels.iter().flat_map(|(key, value)| [key, value]);
+            own.into_iter()
+                .chain(labels)
+                .any(|part| part.to_lowercase().contains(&text))
+        };
+        labels.all(|label| info.has_label(label))
+            && self.name.as_ref().is_none_or(|name| *name == info.name)
+            && (text.is_empty() || written())
+    }
 }
 
 /// Lists the library.
-#[utoipa::path(get, operation_id = "list_components", path = "/v1/components", tag = "components",
-    responses((status = 200, description = "The library, by name and version", body = Components)))]
-pub(crate) async fn list(State(app): State<App>) -> JsonAnswer<Components> {
+#[utoipa::path(get, operation_id = "list_components", path = "/v1/components", tag = "components", params(ListQuery),
+    responses(
+        (status = 200, description = "The library, by name and version", body = Components),
+        (status = "default", description = "What went wrong", body = Problem, content_type = "application/problem+json")))]
+pub(crate) async fn list(State(app): State<App>, InQuery(query): InQuery<ListQuery>) -> JsonAnswer<Components> {
+    let all = app.cell.components().into_iter();
     JsonAnswer(Components {
-        components: app.cell.components().into_iter().map(Into::into).collect(),
+        components: all.filter(|view| query.takes(&view.info)).map(Into::into).collect(),
     })
 }
 
@@ -53,17 +89,51 @@ pub(crate) struct UploadQuery {
     note: Option<String>,
     /// Who uploads it, for people. The header `x-by` does the same.
     by: Option<String>,
+    /// Labels, separated by commas: `stage=pilot,line=3`.
+    labels: Option<String>,
+    /// Take it in even where its trial refuses it; its report says who did so.
+    #[serde(default)]
+    force: bool,
+    /// Only report what an upload would find. Nothing stays.
+    #[serde(default)]
+    dry_run: bool,
 }
 
-/// Uploads a component: the raw bytes of a `.wasm` component, at most 32 MiB. It is inspected and compiled outside of this
-/// process before it is taken in.
+/// `stage=pilot,line=3` as labels.
+fn labels(text: Option<&str>) -> Result<BTreeMap<String, String>, Problem> {
+    let mut labels = BTreeMap::new();
+    for label in text
+        .unwrap_or_default()
+        .split(',')
+        .map(str::trim)
+        .filter(|l| !l.is_empty())
+    {
+        let bad = |what: &str| {
+            let label: String = label.chars().take(80).collect();
+            Problem::new(
+                Kind::Invalid,
+                format!("label {label:?} {what}"),
+                "write labels as key=value,key=value",
+            )
+        };
+        let (key, value) = label.split_once('=').ok_or_else(|| bad("has no value"))?;
+        if labels.insert(key.to_owned(), value.to_owned()).is_some() {
+            return Err(bad("is given twice"));
+        }
+    }
+    Ok(labels)
+}
+
+/// Uploads a component: the raw bytes of a `.wasm` component, at most 32 MiB. It is inspected, compiled outside of this
+/// process, and tried on made-up frames before it is taken in; `admission` says what the trial found.
 #[utoipa::path(post, operation_id = "upload_component", path = "/v1/components", tag = "components", params(UploadQuery),
     request_body(content = Vec<u8>, content_type = "application/wasm", description = "The component"),
     responses(
+        (status = 200, description = "A dry run: what an upload would find", body = Component),
         (status = 201, description = "Taken in, or known already", body = Component),
         (status = 409, description = "Same name and version with other bytes", body = Problem, content_type = "application/problem+json"),
         (status = 413, description = "More than 32 MiB", body = Problem, content_type = "application/problem+json"),
-        (status = 422, description = "Not a component that may run here; says why", body = Problem, content_type = "application/problem+json"),
+        (status = 422, description = "Not a component that may run here, or it failed its trial; says why", body = Problem, content_type = "application/problem+json"),
         (status = "default", description = "Anything else", body = Problem, content_type = "application/problem+json")))]
 pub(crate) async fn upload(
     State(app): State<App>,
@@ -75,6 +145,7 @@ pub(crate) async fn upload(
     let note = words(query.note, &headers, "x-note")?;
     let by = words(query.by, &headers, "x-by")?;
     let by = if by.is_empty() { "api".to_owned() } else { by };
+    let labels = labels(query.labels.as_deref())?;
     // Not even the first byte is read before there is room for all of them.
     let _room = app.uploads.try_acquire().map_err(|_| {
         Problem::new(
@@ -91,7 +162,17 @@ pub(crate) async fn upload(
             "send the bytes of a .wasm component",
         ));
     }
-    let info = finish(app.cell.upload(bytes, by, note)).await?;
+    let upload = Upload {
+        by,
+        note,
+        labels,
+        force: query.force,
+    };
+    if query.dry_run {
+        let info = finish(app.cell.try_out(bytes, upload)).await?;
+        return Ok((StatusCode::OK, JsonAnswer(seen(&app, info))).into_response());
+    }
+    let info = finish(app.cell.upload(bytes, upload)).await?;
     let location = HeaderValue::from_str(&format!("/v1/components/{}", info.digest)).ok();
     let mut response = (StatusCode::CREATED, JsonAnswer(seen(&app, info))).into_response();
     if let Some(location) = location {
@@ -100,7 +181,7 @@ pub(crate) async fn upload(
     Ok(response)
 }
 
-/// Shows one component. `reference` is `name` (the newest version), `name@version`, or a digest or its first 8 digits.
+/// Shows one component, and how far each host is with it. `reference` is `name` (the newest version), `name@version`, or a digest or its first 8 digits.
 #[utoipa::path(get, operation_id = "show_component", path = "/v1/components/{reference}", tag = "components", params(("reference" = String, Path)),
     responses(
         (status = 200, description = "The component", body = Component),
@@ -110,6 +191,37 @@ pub(crate) async fn show(
     InPath(reference): InPath<String>,
 ) -> Result<JsonAnswer<Component>, Problem> {
     let info = app.cell.resolve(&reference)?;
+    let stages = app.cell.stages(info.digest).await?;
+    let mut component = seen(&app, info);
+    component.hosts = Some(stages.into_iter().map(Into::into).collect());
+    Ok(JsonAnswer(component))
+}
+
+/// Changes labels and note of a component, on every host.
+#[utoipa::path(patch, operation_id = "relabel_component", path = "/v1/components/{reference}", tag = "components", params(("reference" = String, Path)),
+    request_body = RelabelRequest,
+    responses(
+        (status = 200, description = "The component as it is now", body = Component),
+        (status = 404, description = "No such component, or no such label to remove", body = Problem, content_type = "application/problem+json"),
+        (status = 422, description = "A label or note that cannot be; says why", body = Problem, content_type = "application/problem+json"),
+        (status = "default", description = "Anything else", body = Problem, content_type = "application/problem+json")))]
+pub(crate) async fn relabel(
+    State(app): State<App>,
+    InPath(reference): InPath<String>,
+    headers: HeaderMap,
+    Json(request): Json<RelabelRequest>,
+) -> Result<JsonAnswer<Component>, Problem> {
+    let note = request
+        .note
+        .map(|note| words(Some(note), &headers, "note"))
+        .transpose()?;
+    let by = words(Some(request.by).filter(|by| !by.is_empty()), &headers, "x-by")?;
+    let change = Relabel {
+        by: if by.is_empty() { "api".to_owned() } else { by },
+        note,
+        labels: request.labels,
+    };
+    let info = finish(app.cell.relabel(reference, change)).await?;
     Ok(JsonAnswer(seen(&app, info)))
 }
 

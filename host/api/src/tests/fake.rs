@@ -7,11 +7,18 @@ use std::sync::{
 
 use bumpless_core::{
     Applied, CommandBody, CommandId, ComponentInfo, Descriptor, Digest, Direction, Event, HostId, LoopId, LoopSpec,
-    Mode, Outcome, PointId, Policy, PortKind, PortSpec, Reading, Record, Strategy, desk::Tally,
+    Migrated, Mode, Outcome, PointId, Policy, PortKind, PortSpec, Reading, Record, Strategy, desk::Tally,
 };
 use bumpless_deploy::{
-    ApplyEnd, Call, CallEnd, Change, CommandEnd, ComponentView, Counters, Error, HostView, LoopDraft, LoopView,
-    PointView,
+    ApplyEnd, Call, CallEnd, Change, CommandEnd, ComponentView, Counters, Error, HostView, Imported, LoopDraft,
+    LoopView, PointView, Relabel, Stage, StageView, Upload,
+};
+use bumpless_deploy::{
+    Window,
+    report::{
+        CurvePoint, CyclesView, Finding, IndexReport, OutputReport, ReplayReport, ShadowView, Skipped, StepTimes,
+        Trial, TrialReport, Verdict,
+    },
 };
 use serde_json::{Value, json};
 use tokio::sync::{Notify, broadcast};
@@ -28,7 +35,9 @@ pub(crate) struct Fake {
     pub(crate) outcome: Mutex<Outcome>,
     pub(crate) commands: Mutex<Vec<(Option<CommandId>, CommandBody)>>,
     pub(crate) drafts: Mutex<Vec<LoopDraft>>,
-    pub(crate) uploads: Mutex<Vec<(Vec<u8>, String, String)>>,
+    pub(crate) uploads: Mutex<Vec<(Vec<u8>, Upload)>>,
+    pub(crate) relabels: Mutex<Vec<Relabel>>,
+    pub(crate) imports: Mutex<Vec<(Vec<u8>, String, bool)>>,
     pub(crate) loops: Mutex<Vec<LoopView>>,
     /// Changes and calls wait for `go_on` while this is set.
     pub(crate) slow: AtomicBool,
@@ -36,6 +45,7 @@ pub(crate) struct Fake {
     /// Changes that came to their end.
     pub(crate) finished: Arc<AtomicUsize>,
     pub(crate) panics: AtomicBool,
+    pub(crate) windows: Mutex<Vec<Window>>,
     records: broadcast::Sender<Arc<Record>>,
 }
 
@@ -48,11 +58,14 @@ impl Fake {
             commands: Mutex::default(),
             drafts: Mutex::default(),
             uploads: Mutex::default(),
+            relabels: Mutex::default(),
+            imports: Mutex::default(),
             loops: Mutex::new(vec![view("l")]),
             slow: AtomicBool::new(false),
             go_on: Arc::default(),
             finished: Arc::default(),
             panics: AtomicBool::new(false),
+            windows: Mutex::default(),
             records: broadcast::channel(FEED_CAPACITY).0,
         }
     }
@@ -129,6 +142,30 @@ fn info() -> ComponentInfo {
         changes: 0,
         history: Vec::new(),
         admission: None,
+    }
+}
+
+/// A report of a trial.
+fn admission(verdict: bumpless_core::Verdict) -> bumpless_core::Admission {
+    bumpless_core::Admission {
+        checked_at_unix_ms: 1,
+        host: host(),
+        verdict,
+        cycles: 400,
+        steps: 300,
+        step_p50_ns: 1_500,
+        step_p99_ns: 2_500,
+        step_worst_ns: 9_000,
+        start_ns: 4_000,
+        migrated: Migrated::Declined,
+        migrate_ns: 3_000,
+        state_bytes: 40,
+        memory_bytes: 1_048_576,
+        compile_ms: None,
+        findings: vec![bumpless_core::Finding {
+            severity: bumpless_core::Severity::Refusal,
+            text: "it trapped".to_owned(),
+        }],
     }
 }
 
@@ -230,10 +267,120 @@ fn apply_end() -> ApplyEnd {
     }
 }
 
+fn trial() -> Trial {
+    Trial {
+        component: "pid".into(),
+        parameters: Default::default(),
+    }
+}
+
+fn shadow(id: LoopId, trial: Trial, cycles_wanted: u64) -> ShadowView {
+    ShadowView {
+        id: 1,
+        cycles_wanted,
+        missed: 0,
+        started_at_unix_ms: 7,
+        ended: None,
+        complete: false,
+        report: trial_report(id, trial),
+    }
+}
+
+fn trial_report(loop_id: LoopId, trial: Trial) -> TrialReport {
+    TrialReport {
+        loop_id,
+        component: trial.component,
+        digest: digest(),
+        parameters: trial.parameters,
+        dropped_parameters: vec!["kd".into()],
+        dropped_ports: vec![],
+        taken_over_by: Some("migrate".into()),
+        anchored_anew: 0,
+        from_ns: 1_000_000,
+        to_ns: 2_000_000,
+        cycles: 2,
+        compared: 2,
+        equal: 1,
+        held: 0,
+        faults: 0,
+        first_fault: None,
+        skipped: vec![],
+        bump_percent: Some(f64::INFINITY),
+        bump_limit_percent: 5.0,
+        outputs: vec![OutputReport {
+            port: "out".into(),
+            unit: "%".into(),
+            span: 100.0,
+            max_percent: 7.0,
+            max_at: (1, 2),
+            mean_percent: 3.5,
+            rms_percent: 5.0,
+            recorded_travel: 1.0,
+            candidate_travel: 8.0,
+        }],
+        steps: StepTimes::default(),
+        indices: IndexReport::default(),
+        verdict: Some(Verdict::Differs),
+        reason: "out is up to 7 % away".into(),
+        measured_port: Some("pv".into()),
+        measured_unit: "bar".into(),
+        cycles_per_point: 1,
+        points: vec![CurvePoint {
+            at_ns: 1_000_000,
+            setpoint: 1.0,
+            measurement: f64::NAN,
+            recorded: vec![1.0],
+            candidate: vec![8.0],
+        }],
+        unread: 0,
+        stopped_early: None,
+    }
+}
+
 impl Cell for Fake {
-    fn upload(&self, bytes: Vec<u8>, by: String, note: String) -> Answer<ComponentInfo> {
-        self.uploads.lock().unwrap().push((bytes, by, note));
+    fn upload(&self, bytes: Vec<u8>, upload: Upload) -> Answer<ComponentInfo> {
+        self.uploads.lock().unwrap().push((bytes, upload));
         self.answer(info())
+    }
+
+    fn try_out(&self, _: Vec<u8>, upload: Upload) -> Answer<ComponentInfo> {
+        self.answer(ComponentInfo {
+            note: upload.note,
+            admission: Some(admission(bumpless_core::Verdict::Refused)),
+            ..info()
+        })
+    }
+
+    fn relabel(&self, _: String, change: Relabel) -> Answer<ComponentInfo> {
+        self.relabels.lock().unwrap().push(change);
+        self.answer(info())
+    }
+
+    fn stages(&self, _: Digest) -> Answer<Vec<StageView>> {
+        let stage = |name: &str, stage| StageView {
+            host: HostId::new(name).expect("valid"),
+            stage,
+        };
+        self.answer(vec![
+            stage("a", Stage::Compiling),
+            stage("b", Stage::Failed("no memory".to_owned())),
+            stage("h", Stage::Ready),
+        ])
+    }
+
+    fn export(&self, references: Vec<String>) -> Answer<Vec<u8>> {
+        self.answer(references.join("+").into_bytes())
+    }
+
+    fn import(&self, bytes: Vec<u8>, by: String, force: bool) -> Answer<Vec<Imported>> {
+        self.imports.lock().unwrap().push((bytes, by, force));
+        let ends = [Ok(info()), Err(Error::invalid("it is not whole", "export it again"))];
+        let ends = ends.map(|end| Imported {
+            name: "pid@1.0.0".to_owned(),
+            end,
+            known: false,
+        });
+        self.answer(ends.to_vec())
     }
 
     fn components(&self) -> Vec<ComponentView> {
@@ -306,6 +453,59 @@ impl Cell for Fake {
 
     fn move_owner(&self, _: LoopId, _: HostId) -> Answer<()> {
         self.answer(())
+    }
+
+    fn cycles(&self, id: LoopId, window: Window, max: u32) -> Answer<CyclesView> {
+        self.windows.lock().unwrap().push(window);
+        self.answer(CyclesView {
+            records: (1..=3.min(u64::from(max)))
+                .map(|seq| record(id.as_str(), seq))
+                .collect(),
+            more: max < 3,
+            unread: 0,
+        })
+    }
+
+    fn replay(&self, loop_id: LoopId, window: Window) -> Answer<ReplayReport> {
+        self.windows.lock().unwrap().push(window);
+        self.answer(ReplayReport {
+            loop_id,
+            from_ns: 5_000_000,
+            to_ns: 9_000_000,
+            compared: 9,
+            equal: 8,
+            skipped: vec![Skipped {
+                reason: "a switch".into(),
+                cycles: 2,
+            }],
+            first_difference: Some(Finding {
+                position: (2, 7),
+                text: "output out was 1, and is 2 now".into(),
+            }),
+            unread: 1,
+            stopped_early: None,
+        })
+    }
+
+    fn backtest(&self, loop_id: LoopId, trial: Trial, window: Window) -> Answer<TrialReport> {
+        self.windows.lock().unwrap().push(window);
+        self.answer(trial_report(loop_id, trial))
+    }
+
+    fn start_shadow(&self, id: LoopId, trial: Trial, cycles: u64) -> Answer<ShadowView> {
+        self.answer(shadow(id, trial, cycles))
+    }
+
+    fn shadows(&self, id: LoopId) -> Answer<Vec<ShadowView>> {
+        self.answer(vec![shadow(id, trial(), 5)])
+    }
+
+    fn show_shadow(&self, id: LoopId, number: u64) -> Answer<ShadowView> {
+        self.answer(shadow(id, trial(), number))
+    }
+
+    fn stop_shadow(&self, id: LoopId, number: u64) -> Answer<ShadowView> {
+        self.answer(shadow(id, trial(), number))
     }
 
     fn hosts(&self) -> Vec<HostView> {

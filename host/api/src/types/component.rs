@@ -1,10 +1,12 @@
 //! Components of the library.
 
+use std::collections::BTreeMap;
+
 use bumpless_deploy::ComponentView;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-use super::{Direction, PortKind};
+use super::{Admission, ComponentEvent, ComponentHost, Direction, PortKind};
 
 /// The library, by name and version.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
@@ -30,6 +32,8 @@ pub struct Component {
     pub parameters: Vec<Parameter>,
     /// Version of the layout of its state.
     pub state_layout: u32,
+    /// The world that it was taken in for.
+    pub world: String,
     /// Interfaces that it imports.
     pub imports: Vec<String>,
     /// Its size in bytes.
@@ -38,12 +42,21 @@ pub struct Component {
     pub uploaded_at_unix_ms: u64,
     /// Who uploaded it.
     pub uploaded_by: String,
-    /// What the uploader wrote about it.
+    /// What people wrote about it.
     pub note: String,
+    /// What it is sorted by.
+    pub labels: BTreeMap<String, String>,
+    /// The last things that happened to it, the newest last.
+    pub history: Vec<ComponentEvent>,
+    /// What its trial found; null where it had none.
+    pub admission: Option<Admission>,
     /// Loops that run it, or keep it to go back to.
     pub used_by: Vec<String>,
     /// Hosts that hold it compiled.
     pub ready_on: Vec<String>,
+    /// How far each host is with it; only where one component is asked for, null otherwise.
+    #[serde(default)]
+    pub hosts: Option<Vec<ComponentHost>>,
 }
 
 /// One named value that a component reads or writes.
@@ -123,13 +136,26 @@ impl From<ComponentView> for Component {
                 })
                 .collect(),
             state_layout: info.descriptor.state_layout,
+            world: info.world,
             imports: info.imports,
             size_bytes: info.bytes,
             uploaded_at_unix_ms: info.uploaded_at_unix_ms,
             uploaded_by: info.uploaded_by,
             note: info.note,
+            labels: info.labels,
+            history: info
+                .history
+                .into_iter()
+                .map(|event| ComponentEvent {
+                    at_unix_ms: event.at_unix_ms,
+                    by: event.by,
+                    what: event.what,
+                })
+                .collect(),
+            admission: info.admission.map(Into::into),
             used_by: used_by.iter().map(ToString::to_string).collect(),
             ready_on: ready_on.iter().map(ToString::to_string).collect(),
+            hosts: None,
         }
     }
 }
