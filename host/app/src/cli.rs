@@ -7,6 +7,10 @@ use std::path::PathBuf;
 use clap::{CommandFactory as _, Parser, Subcommand, ValueEnum};
 use clap_complete::Shell;
 
+mod history;
+
+pub(crate) use history::{CandidateArgs, HistoryCommand};
+
 use crate::{client::Client, commands, demo, error::Error, host, watch};
 
 /// Where the API is expected.
@@ -227,6 +231,8 @@ pub(crate) enum LoopCommand {
         /// The host.
         host: String,
     },
+    #[command(flatten)]
+    History(HistoryCommand),
 }
 
 /// Who decides the output.
@@ -371,6 +377,11 @@ mod tests {
             "bumpless loop output pressure -4.5",
             "bumpless loop output pressure valve=4 pump=5",
             "bumpless loop rollback pressure --to 3",
+            "bumpless loop cycles pressure",
+            "bumpless loop replay pressure --last 10m",
+            "bumpless loop backtest pressure pidplus -p k=2 -p action=direct --last 5000 --plot x.svg",
+            "bumpless loop shadow pressure pidplus --cycles 200 --wait",
+            "bumpless loop shadows pressure 3 --stop",
             "bumpless call pid --input pv=1 --input ff=-2 --strategy latency",
             "bumpless watch pressure --plain --cycles 5",
             "bumpless demo --for 5 --restart",
@@ -383,6 +394,7 @@ mod tests {
             ("bumpless host", "--config"),
             ("bumpless loop set pressure", "KEY=VALUE"),
             ("bumpless loop set pressure setpoint", "write it as KEY=VALUE"),
+            ("bumpless loop shadows pressure --stop", "<ID>"),
             ("bumpless loop mode pressure fast", "[possible values: manual, auto]"),
             ("bumpless call pid --input pv=x", "\"x\" is no number"),
             ("bumpless call pid --strategy best", "use round-robin, random, cpu"),

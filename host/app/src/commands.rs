@@ -3,5 +3,7 @@
 //! Never: decide; what the cell refuses is an error with the cell's own words.
 
 pub(crate) mod components;
+pub(crate) mod curves;
+pub(crate) mod history;
 pub(crate) mod hosts;
 pub(crate) mod loops;

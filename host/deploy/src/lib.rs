@@ -52,6 +52,7 @@ pub mod limits;
 pub mod report;
 pub mod view;
 
+pub use bumpless_store::Window;
 pub use deploy::Deploy;
 pub use draft::{Change, LoopDraft};
 pub use error::{Error, Words};

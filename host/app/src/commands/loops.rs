@@ -8,6 +8,7 @@ use bumpless_api::types::{
 };
 use serde::Serialize;
 
+use super::history;
 use crate::{
     cli::{LoopCommand, ModeWord},
     client::{Answer, Client, encoded},
@@ -42,6 +43,7 @@ pub(crate) fn run(client: &Client, json: bool, what: LoopCommand) -> Result<(), 
             client.delete(&path(&name, ""))?;
             show::line(&format!("{name} ended; its outputs stay as they are"))
         }
+        LoopCommand::History(what) => history::run(client, json, what),
         LoopCommand::Move { name, host } => {
             client.post(&path(&name, "/move"), &MoveRequest { host: host.clone() })?;
             show::line(&format!("{name} is {host}'s from the next cycle on"))
@@ -209,7 +211,7 @@ fn component(client: &Client, name: &str) -> Result<Component, Error> {
 }
 
 /// The number of a parameter's word.
-fn choice(component: &Component, key: &str, word: &str) -> Result<f64, Error> {
+pub(super) fn choice(component: &Component, key: &str, word: &str) -> Result<f64, Error> {
     let Some(parameter) = component.parameters.iter().find(|p| p.name == key) else {
         let known: Vec<&str> = component.parameters.iter().map(|p| p.name.as_str()).collect();
         return Err(Error::Usage(format!(
