@@ -4,7 +4,9 @@
 //! |---|---|
 //! | story | a loop's whole life: swaps, commands, the death of its owner |
 //! | restarts | the whole cell, or the I/O host alone, dies and comes back |
+//! | changes | what may change while a loop runs, what brings it back, and owners that die meanwhile |
 //! | members | frozen owners, late hosts, draining |
+//! | history | replays, backtests, shadows |
 //! | calls | the cell as a control service |
 //! | refusals | bad components, loops, requests, configurations, command lines |
 //! | modbus | a real Modbus device that dies and comes back |
@@ -21,7 +23,9 @@
 )]
 
 mod calls;
+mod changes;
 mod guides;
+mod history;
 mod house;
 mod members;
 mod modbus;
