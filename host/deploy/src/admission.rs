@@ -49,7 +49,7 @@ impl Room {
             .map_err(crowded)?
             .map_err(|_| stopping())?;
         let trial = on_own_thread(move || trial::run(&prepared)).await?;
-        Ok(report(trial, self.here.clone(), imports, compile_time))
+        Ok(report(&trial, self.here.clone(), imports, compile_time))
     }
 }
 
@@ -78,7 +78,7 @@ async fn on_own_thread<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'sta
         .map_err(|_| Error::internal("the trial of a component ended badly"))
 }
 
-fn report(trial: trial::Trial, host: HostId, imports: &[String], compile_time: Option<Duration>) -> Admission {
+fn report(trial: &trial::Trial, host: HostId, imports: &[String], compile_time: Option<Duration>) -> Admission {
     let mut findings = trial.findings.clone();
     let names: Vec<&str> = imports
         .iter()
@@ -212,7 +212,7 @@ mod tests {
             "bumpless:control/log@0.1.0".to_owned(),
         ];
         report(
-            trial(findings),
+            &trial(findings),
             HostId::new("h").unwrap(),
             &imports,
             Some(Duration::from_millis(12)),

@@ -147,12 +147,12 @@ pub(crate) fn unpack(bytes: &[u8]) -> Result<Vec<Entry>, Error> {
     let layout: Layout = document(&files, LAYOUT)?;
     if !layout.image_layout_version.starts_with("1.") {
         let version: String = layout.image_layout_version.chars().take(20).collect();
-        return Err(no_bundle(format!("its layout has version {version:?}, not 1")));
+        return Err(no_bundle(&format!("its layout has version {version:?}, not 1")));
     }
     let index: Index = document(&files, INDEX)?;
     let count = index.manifests.len();
     if count == 0 || count > BUNDLE_COMPONENTS_MAX {
-        return Err(no_bundle(format!(
+        return Err(no_bundle(&format!(
             "its index lists {count} components, not 1 to {BUNDLE_COMPONENTS_MAX}"
         )));
     }
@@ -163,7 +163,7 @@ pub(crate) fn unpack(bytes: &[u8]) -> Result<Vec<Entry>, Error> {
     Ok(entries.collect())
 }
 
-fn no_bundle(reason: String) -> Error {
+fn no_bundle(reason: &str) -> Error {
     Error::invalid(
         format!("this is no bundle: {reason}"),
         "export one again; a bundle is an OCI image layout in a tar that is not compressed",
@@ -172,12 +172,14 @@ fn no_bundle(reason: String) -> Error {
 
 /// The files by path, where they stand in the archive. Nothing is copied.
 fn list(bytes: &[u8]) -> Result<BTreeMap<String, &[u8]>, Error> {
-    let broken = |error: std::io::Error| no_bundle(format!("the tar cannot be read: {error}"));
+    let broken = |error: std::io::Error| no_bundle(&format!("the tar cannot be read: {error}"));
     let mut archive = tar::Archive::new(Cursor::new(bytes));
     let mut files = BTreeMap::new();
     for (number, entry) in archive.entries().map_err(broken)?.enumerate() {
         if number >= BUNDLE_ENTRIES_MAX {
-            return Err(no_bundle(format!("the tar has more than {BUNDLE_ENTRIES_MAX} entries")));
+            return Err(no_bundle(&format!(
+                "the tar has more than {BUNDLE_ENTRIES_MAX} entries"
+            )));
         }
         let entry = entry.map_err(broken)?;
         // Folders are of no matter; links and sparse files are not what they seem.
@@ -191,22 +193,22 @@ fn list(bytes: &[u8]) -> Result<BTreeMap<String, &[u8]>, Error> {
             .and_then(|(from, size)| bytes.get(from..from.checked_add(size)?));
         let short: String = path.chars().take(100).collect();
         let Some(part) = part else {
-            return Err(no_bundle(format!("file {short:?} is cut short")));
+            return Err(no_bundle(&format!("file {short:?} is cut short")));
         };
         let plain = path.strip_prefix("./").unwrap_or(&path).to_owned();
         if files.insert(plain, part).is_some() {
-            return Err(no_bundle(format!("file {short:?} is in it twice")));
+            return Err(no_bundle(&format!("file {short:?} is in it twice")));
         }
     }
     Ok(files)
 }
 
 fn document<T: DeserializeOwned>(files: &BTreeMap<String, &[u8]>, path: &str) -> Result<T, Error> {
-    let bytes = files.get(path).ok_or_else(|| no_bundle(format!("it has no {path}")))?;
+    let bytes = files.get(path).ok_or_else(|| no_bundle(&format!("it has no {path}")))?;
     if bytes.len() > BUNDLE_DOCUMENT_BYTES_MAX {
-        return Err(no_bundle(format!("its {path} has {} bytes", bytes.len())));
+        return Err(no_bundle(&format!("its {path} has {} bytes", bytes.len())));
     }
-    serde_json::from_slice(bytes).map_err(|error| no_bundle(format!("its {path}: {error}")))
+    serde_json::from_slice(bytes).map_err(|error| no_bundle(&format!("its {path}: {error}")))
 }
 
 /// The bytes of a content, which are what its digest and size say.

@@ -188,8 +188,8 @@ impl<'a> Maker<'a> {
             Kind::Manual if i < 25 => Mode::Manual,
             _ => Mode::Automatic,
         };
-        if kind == Kind::Manual && i % 8 == 0 && mode == Mode::Manual {
-            let moved = if i % 16 == 0 { 30.0 } else { 70.0 };
+        if kind == Kind::Manual && i.is_multiple_of(8) && mode == Mode::Manual {
+            let moved = if i.is_multiple_of(16) { 30.0 } else { 70.0 };
             for (port, _) in self.descriptor.outputs() {
                 if let Some(held) = self.held.get_mut(port) {
                     *held = moved;
@@ -223,7 +223,7 @@ impl<'a> Maker<'a> {
             });
         }
         let messages = if kind == Kind::Messages {
-            let length = if i % 2 == 0 { MESSAGE_BYTES_MAX } else { 0 };
+            let length = if i.is_multiple_of(2) { MESSAGE_BYTES_MAX } else { 0 };
             let data = (0..length).map(|_| (self.noise() * 127.0) as i8 as u8).collect();
             vec![Message {
                 topic: "trial".to_owned(),

@@ -192,7 +192,7 @@ impl Run<'_> {
             }
         }
         self.growth(settled, used.memory_bytes() as u64);
-        let (at, state) = good.unwrap_or_else(|| (maker, state));
+        let (at, state) = good.unwrap_or((maker, state));
         self.migrate(&mut used, &state, at)
     }
 
