@@ -207,6 +207,21 @@ impl Collector for Scrape {
                 "Messages dropped because a queue was full",
                 c.arrivals_dropped,
             ),
+            (
+                "cycles_recorded",
+                "Cycles in the log on disk, loops whose home is here",
+                c.cycles_recorded,
+            ),
+            (
+                "cycles_unrecorded",
+                "Cycles that the log dropped because too many waited for the disk",
+                c.cycles_unrecorded,
+            ),
+            (
+                "cycle_log_damaged",
+                "Pieces of the log that could not be read",
+                c.cycle_log_damaged,
+            ),
         ] {
             let metric = ConstCounter::new(value);
             metric.encode(encoder.encode_descriptor(name, help, None, metric.metric_type())?)?;
@@ -218,6 +233,7 @@ impl Collector for Scrape {
             ("loops_held", "Loops held here, owned or standing by", c.loops_held),
             ("loops_owned", "Loops owned here", c.loops_owned),
             ("components", "Components in the library", c.components),
+            ("cycle_log_bytes", "Bytes of recorded cycles on disk", c.cycle_log_bytes),
         ] {
             let metric = ConstGauge::new(value);
             metric.encode(encoder.encode_descriptor(name, help, None, metric.metric_type())?)?;

@@ -508,6 +508,7 @@ impl Room {
     pub(crate) fn counters(&self) -> Counters {
         let now = Instant::now();
         let get = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
+        let log = self.cycles.as_ref().map(|cycles| cycles.counts()).unwrap_or_default();
         let mut counters = Counters {
             hosts_alive: self.roster.all().iter().filter(|(_, seen)| seen.alive(now)).count() as u64,
             loops_known: self.book.len() as u64,
@@ -526,6 +527,10 @@ impl Room {
             requests: get(&self.tallies.requests),
             malformed: get(&self.tallies.malformed),
             arrivals_dropped: get(&self.tallies.arrivals_dropped),
+            cycles_recorded: log.written,
+            cycles_unrecorded: log.dropped,
+            cycle_log_damaged: log.damaged,
+            cycle_log_bytes: log.bytes,
             ..Counters::default()
         };
         for intent in self.book.all().iter().filter(|intent| intent.home == self.here) {

@@ -106,12 +106,9 @@ impl Room {
         self.shadows.forget(id);
         let Some(cycles) = self.cycles.clone() else { return };
         let loop_id = id.clone();
-        match on_disk(move || cycles.forget(&loop_id)).await {
-            Ok(Ok(())) => {}
-            Ok(Err(error)) => {
-                tracing::warn!(loop_id = %id, %error, "recorded cycles of a deleted loop are still on disk")
-            }
-            Err(error) => tracing::warn!(loop_id = %id, %error, "recorded cycles of a deleted loop are still on disk"),
+        let end = on_disk(move || cycles.forget(&loop_id)).await;
+        if let Err(error) = end.and_then(|end| end.map_err(Error::from)) {
+            tracing::warn!(loop_id = %id, %error, "recorded cycles of a deleted loop are still on disk");
         }
     }
 

@@ -314,4 +314,12 @@ pub struct Counters {
     pub malformed: u64,
     /// Messages for deploy that were dropped because its queue was full.
     pub arrivals_dropped: u64,
+    /// Cycles of loops at home here that are in the log on disk, counted since the host started.
+    pub cycles_recorded: u64,
+    /// Cycles that the log dropped because too many waited for the disk.
+    pub cycles_unrecorded: u64,
+    /// Pieces of the log that could not be read; each try counts.
+    pub cycle_log_damaged: u64,
+    /// Bytes of the log (as of now).
+    pub cycle_log_bytes: u64,
 }
