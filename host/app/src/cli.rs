@@ -8,8 +8,10 @@ use clap::{CommandFactory as _, Parser, Subcommand, ValueEnum};
 use clap_complete::Shell;
 
 mod history;
+mod library;
 
 pub(crate) use history::{CandidateArgs, HistoryCommand};
+pub(crate) use library::{ComponentsArgs, ComponentsCommand, FilterArgs, UploadArgs};
 
 use crate::{client::Client, commands, demo, error::Error, host, watch};
 
@@ -47,18 +49,9 @@ pub(crate) enum Command {
     /// Start a whole cell on this machine: a simulated plant, three controller hosts, one running loop.
     Demo(DemoArgs),
     /// Upload a component (a .wasm file) to the cell's library.
-    Upload {
-        /// The component.
-        file: PathBuf,
-        /// A line about it, for people.
-        #[arg(long, default_value = "")]
-        note: String,
-    },
-    /// The library: list, show, download, delete.
-    Components {
-        #[command(subcommand)]
-        what: Option<ComponentsCommand>,
-    },
+    Upload(UploadArgs),
+    /// The library: list, show, label, download, export, import, delete.
+    Components(ComponentsArgs),
     /// Loops: apply, list, show, command, swap, roll back.
     Loop {
         #[command(subcommand)]
@@ -131,31 +124,6 @@ pub(crate) struct DemoArgs {
     /// Start a host that died again.
     #[arg(long)]
     pub(crate) restart: bool,
-}
-
-/// What can be done with the library.
-#[derive(Debug, Subcommand)]
-pub(crate) enum ComponentsCommand {
-    /// List it.
-    List,
-    /// Show one: ports, parameters, where it runs.
-    Show {
-        /// `name`, `name@version`, or a digest or its first 8 digits.
-        component: String,
-    },
-    /// Download one.
-    Download {
-        /// `name`, `name@version`, or a digest or its first 8 digits.
-        component: String,
-        /// Where to; `name-version.wasm` where not given.
-        #[arg(long, short, value_name = "FILE")]
-        output: Option<PathBuf>,
-    },
-    /// Delete one that no loop uses.
-    Delete {
-        /// `name`, `name@version`, or a digest or its first 8 digits.
-        component: String,
-    },
 }
 
 /// What can be done with loops.
@@ -329,9 +297,9 @@ pub fn run(cli: Cli) -> Result<(), Error> {
     match cli.command {
         Command::Host(args) => host::run(&args),
         Command::Demo(args) => demo::run(&args),
-        Command::Upload { file, note } => commands::components::upload(&client()?, json, &file, &note),
-        Command::Components { what } => {
-            commands::components::run(&client()?, json, what.unwrap_or(ComponentsCommand::List))
+        Command::Upload(args) => commands::components::upload(&client()?, json, &args),
+        Command::Components(ComponentsArgs { filter, what }) => {
+            commands::components::run(&client()?, json, what.unwrap_or(ComponentsCommand::List(filter)))
         }
         Command::Loop { what } => commands::loops::run(&client()?, json, what),
         Command::Call(args) => commands::components::call(&client()?, json, args),
@@ -366,7 +334,15 @@ mod tests {
         for good in [
             "bumpless host --config host.toml --data /tmp/x --check",
             "bumpless upload pid.wasm --note x --json",
+            "bumpless upload pid.wasm --label stage=pilot --label line=3 --force --wait",
+            "bumpless upload pid.wasm --dry-run",
             "bumpless components",
+            "bumpless components --label stage=pilot --name pid --text pump",
+            "bumpless components list --label stage",
+            "bumpless components label pid stage=pilot line-",
+            "bumpless components note pid@1.0.0 for_the_pilot",
+            "bumpless components export pid on-off@1.0.0 -o laws.tar",
+            "bumpless components import laws.tar --force",
             "bumpless --json components show pid@1.0.0",
             "bumpless components download pid -o x.wasm",
             "bumpless loop apply loop.toml",
@@ -392,6 +368,10 @@ mod tests {
         }
         for (bad, part) in [
             ("bumpless host", "--config"),
+            ("bumpless upload pid.wasm --dry-run --force", "cannot be used with"),
+            ("bumpless components label pid", "<KEY=VALUE|KEY->"),
+            ("bumpless components label pid stage", "KEY- to remove it"),
+            ("bumpless components export pid", "--output"),
             ("bumpless loop set pressure", "KEY=VALUE"),
             ("bumpless loop set pressure setpoint", "write it as KEY=VALUE"),
             ("bumpless loop shadows pressure --stop", "<ID>"),

@@ -15,8 +15,10 @@ use crate::error::Error;
 
 /// Longest wait for a connection: a host that does not take one in this time is not there.
 const CONNECT_TIME_MAX: Duration = Duration::from_secs(3);
-/// Longest wait for the head of an answer: above the longest that the API allows itself for an upload.
+/// Longest wait for the head of an answer: above the longest that the API allows itself for a change.
 const ANSWER_TIME_MAX: Duration = Duration::from_secs(160);
+/// Longest wait where the cell compiles and tries what it is sent: above the longest that the API allows itself for that.
+const WORK_TIME_MAX: Duration = Duration::from_secs(920);
 /// Longest time for the rest of an answer.
 const BODY_TIME_MAX: Duration = Duration::from_secs(120);
 /// Bytes of an answer: the longest list of loops has some tens of MB.
@@ -131,7 +133,11 @@ impl Client {
     /// `GET` of raw bytes, at most `bytes_max`.
     pub(crate) fn bytes(&self, path: &str, bytes_max: u64) -> Result<Vec<u8>, Error> {
         let request = self.agent.get(format!("{}{path}", self.base));
-        let response = self.good(request.config().timeout_recv_body(Some(BODY_TIME_MAX)).build().call())?;
+        let request = request
+            .config()
+            .timeout_recv_response(Some(WORK_TIME_MAX))
+            .timeout_recv_body(Some(BODY_TIME_MAX));
+        let response = self.good(request.build().call())?;
         response
             .into_body()
             .with_config()
@@ -162,12 +168,26 @@ impl Client {
         self.answer(self.agent.delete(format!("{}{path}", self.base)).call())
     }
 
-    /// `POST` of `length` bytes of a component.
-    pub(crate) fn upload(&self, path: &str, length: u64, bytes: &mut dyn Read) -> Result<Answer, Error> {
+    /// `PATCH` of JSON.
+    pub(crate) fn patch(&self, path: &str, body: &impl Serialize) -> Result<Answer, Error> {
+        self.answer(self.agent.patch(format!("{}{path}", self.base)).send_json(body))
+    }
+
+    /// `POST` of `length` bytes of a type, which the cell may work on for long.
+    pub(crate) fn send_file(
+        &self,
+        path: &str,
+        content_type: &str,
+        length: u64,
+        bytes: &mut dyn Read,
+    ) -> Result<Answer, Error> {
         let request = self
             .agent
             .post(format!("{}{path}", self.base))
-            .header("content-type", "application/wasm")
+            .config()
+            .timeout_recv_response(Some(WORK_TIME_MAX))
+            .build()
+            .header("content-type", content_type)
             .header("content-length", length.to_string());
         self.answer(request.send(SendBody::from_reader(bytes)))
     }

@@ -6,4 +6,5 @@ pub(crate) mod components;
 pub(crate) mod curves;
 pub(crate) mod history;
 pub(crate) mod hosts;
+pub(crate) mod library;
 pub(crate) mod loops;

@@ -51,7 +51,7 @@ pub(crate) fn run(args: &DemoArgs) -> Result<(), Error> {
     wait_until_whole(&client, &stop)?;
     for name in COMPONENTS {
         let file = components.join(format!("{name}.wasm"));
-        let (component, _) = commands::components::send(&client, &file, "stock controller", false)?;
+        let (component, _) = commands::components::send(&client, &file, "note=stock%20controller", false)?;
         show::note(&format!("uploaded {}@{}", component.name, component.version));
     }
     let file = dir.join("pressure.toml");

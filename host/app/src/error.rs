@@ -55,6 +55,12 @@ pub enum Error {
     /// The cell said no.
     #[error("{}: {}", .0.title, .0.detail)]
     Problem(Box<Problem>),
+    /// The cell took a part and refused the rest; each part's words are in the answer.
+    #[error("{0}")]
+    Refused(String),
+    /// Not every host is as far as was waited for.
+    #[error("{0}")]
+    Unready(String),
     /// No answer from the API.
     #[error("{api} could not be reached: {reason}")]
     Unreachable {
@@ -102,6 +108,7 @@ impl Error {
         match self {
             Self::Usage(_) => 2,
             Self::Problem(problem) if problem.status < 500 => 3,
+            Self::Refused(_) => 3,
             Self::Unreachable { .. } => 4,
             _ => 1,
         }

@@ -1,4 +1,4 @@
-//! `upload`, `components` and `call`.
+//! `upload`, `components` and `call`. Labels, bundles and reports are in `library`.
 
 use std::{
     collections::BTreeMap,
@@ -11,33 +11,56 @@ use bumpless_api::types::{CallAnswer, CallRequest, Component, Components, Direct
 use bumpless_core::limits::COMPONENT_BYTES_MAX;
 use indicatif::{ProgressBar, ProgressStyle};
 
+use super::library;
 use crate::{
-    cli::{CallArgs, ComponentsCommand},
+    cli::{CallArgs, ComponentsCommand, FilterArgs, UploadArgs},
     client::{Client, encoded},
     error::Error,
     show,
 };
 
-/// Uploads a file, with a progress bar where somebody looks.
-pub(crate) fn upload(client: &Client, json: bool, file: &Path, note: &str) -> Result<(), Error> {
-    let component = send(client, file, note, std::io::stderr().is_terminal() && !json)?;
+/// Uploads a file, with a progress bar where somebody looks, and prints what its trial found.
+pub(crate) fn upload(client: &Client, json: bool, args: &UploadArgs) -> Result<(), Error> {
+    let labels: Vec<String> = args
+        .labels
+        .iter()
+        .map(|(key, value)| format!("{key}={value}"))
+        .collect();
+    let query = format!(
+        "note={}&labels={}&force={}&dry_run={}",
+        encoded(&args.note),
+        encoded(&labels.join(",")),
+        args.force,
+        args.dry_run
+    );
+    let (component, text) = send(client, &args.file, &query, std::io::stderr().is_terminal() && !json)?;
     if json {
-        return show::json(&component.1);
+        show::json(&text)?;
+    } else {
+        show::line(&format!(
+            "{}@{} {} ({}, {} ports, {} parameters)",
+            component.name,
+            component.version,
+            show::short(&component.digest),
+            show::size(component.size_bytes),
+            component.ports.len(),
+            component.parameters.len()
+        ))?;
+        for line in component.admission.iter().flat_map(library::report) {
+            show::line(&line)?;
+        }
     }
-    let component = component.0;
-    show::line(&format!(
-        "{}@{} {} ({}, {} ports, {} parameters)",
-        component.name,
-        component.version,
-        show::short(&component.digest),
-        show::size(component.size_bytes),
-        component.ports.len(),
-        component.parameters.len()
-    ))
+    if args.dry_run && component.admission.is_some_and(|report| report.verdict == "refused") {
+        return Err(Error::Refused("an upload would be refused".to_owned()));
+    }
+    if args.wait {
+        library::wait(client, &component.digest)?;
+    }
+    Ok(())
 }
 
-/// Uploads a file; gives what the cell made of it, and its own text.
-pub(crate) fn send(client: &Client, file: &Path, note: &str, bar: bool) -> Result<(Component, String), Error> {
+/// Uploads a file; gives what the cell made of it, and its own text. `query` says what there is to say about it.
+pub(crate) fn send(client: &Client, file: &Path, query: &str, bar: bool) -> Result<(Component, String), Error> {
     let failed = |source| Error::File {
         path: file.to_owned(),
         action: "read",
@@ -61,15 +84,9 @@ pub(crate) fn send(client: &Client, file: &Path, note: &str, bar: bool) -> Resul
         progress.set_style(style);
     }
     progress.set_message(file.file_name().unwrap_or_default().to_string_lossy().into_owned());
-    let by = std::env::var("USER").unwrap_or_default();
-    let by = if by.is_empty() {
-        String::new()
-    } else {
-        format!("&by={}", encoded(&by))
-    };
-    let path = format!("/v1/components?note={}{by}", encoded(note));
+    let path = format!("/v1/components?{query}&by={}", encoded(&library::me()));
     let mut reader = progress.wrap_read(opened);
-    let answer = client.upload(&path, length, &mut reader);
+    let answer = client.send_file(&path, "application/wasm", length, &mut reader);
     progress.finish_and_clear();
     let answer = answer?;
     Ok((answer.decode()?, answer.text))
@@ -78,7 +95,13 @@ pub(crate) fn send(client: &Client, file: &Path, note: &str, bar: bool) -> Resul
 /// The library.
 pub(crate) fn run(client: &Client, json: bool, what: ComponentsCommand) -> Result<(), Error> {
     match what {
-        ComponentsCommand::List => list(client, json),
+        ComponentsCommand::List(filter) => list(client, json, &filter),
+        ComponentsCommand::Label { component, labels } => library::relabel(client, json, &component, labels, None),
+        ComponentsCommand::Note { component, note } => {
+            library::relabel(client, json, &component, Vec::new(), Some(note))
+        }
+        ComponentsCommand::Export { components, output } => library::export(client, &components, &output),
+        ComponentsCommand::Import { file, force } => library::import(client, json, &file, force),
         ComponentsCommand::Show { component } => show_one(client, json, &component),
         ComponentsCommand::Download { component, output } => download(client, &component, output),
         ComponentsCommand::Delete { component } => {
@@ -92,20 +115,46 @@ fn path(component: &str) -> String {
     format!("/v1/components/{}", encoded(component))
 }
 
-fn list(client: &Client, json: bool) -> Result<(), Error> {
-    let answer = client.get("/v1/components")?;
+fn list(client: &Client, json: bool, filter: &FilterArgs) -> Result<(), Error> {
+    let mut query = format!("/v1/components?label={}", encoded(&filter.labels.join(",")));
+    for (key, value) in [("name", &filter.name), ("text", &filter.text)] {
+        if let Some(value) = value {
+            query.push_str(&format!("&{key}={}", encoded(value)));
+        }
+    }
+    let answer = client.get(&query)?;
     if json {
         return show::json(&answer.text);
     }
     let components: Components = answer.decode()?;
-    let mut table = show::table(&["component", "digest", "size", "used by", "ready on", "what", "note"]);
+    let mut table = show::table(&[
+        "component",
+        "digest",
+        "size",
+        "trial",
+        "used by",
+        "ready on",
+        "labels",
+        "what",
+        "note",
+    ]);
     for component in components.components {
         table.add_row([
             format!("{}@{}", component.name, component.version),
             show::short(&component.digest).to_owned(),
             show::size(component.size_bytes),
+            component
+                .admission
+                .as_ref()
+                .map(|report| report.verdict.clone())
+                .unwrap_or_default(),
             component.used_by.join(", "),
             component.ready_on.join(", "),
+            if component.labels.is_empty() {
+                String::new()
+            } else {
+                library::labels_line(&component.labels)
+            },
             component.text,
             component.note,
         ]);
@@ -127,8 +176,26 @@ fn show_one(client: &Client, json: bool, component: &str) -> Result<(), Error> {
         c.state_layout
     ))?;
     show::line(&format!("used by   {}", c.used_by.join(", ")))?;
-    show::line(&format!("ready on  {}", c.ready_on.join(", ")))?;
-    show::line(&format!("imports   {}\n", c.imports.join(", ")))?;
+    for host in c.hosts.iter().flatten() {
+        show::line(&format!("on {:<6} {}", host.host, library::stage_line(host)))?;
+    }
+    show::line(&format!("world     {}", c.world))?;
+    show::line(&format!("imports   {}", c.imports.join(", ")))?;
+    show::line(&format!("labels    {}", library::labels_line(&c.labels)))?;
+    if !c.note.is_empty() {
+        show::line(&format!("note      {}", c.note))?;
+    }
+    let now_ms = std::time::SystemTime::now()
+        .duration_since(std::time::UNIX_EPOCH)
+        .map_or(0, |since| since.as_millis() as u64);
+    for event in &c.history {
+        let age = show::age(now_ms.saturating_sub(event.at_unix_ms));
+        show::line(&format!("history   {age} ago, {}: {}", event.by, event.what))?;
+    }
+    for line in c.admission.iter().flat_map(library::report) {
+        show::line(&line)?;
+    }
+    show::line("")?;
     let mut ports = show::table(&["port", "direction", "unit", "required", "what"]);
     for port in &c.ports {
         ports.add_row([

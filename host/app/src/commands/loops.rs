@@ -114,6 +114,9 @@ fn applied(json: bool, answer: &Answer) -> Result<(), Error> {
             end.dropped_ports.join(", ")
         ))?;
     }
+    for warning in &end.warnings {
+        show::line(&format!("  warning: {warning}"))?;
+    }
     Ok(())
 }
 
