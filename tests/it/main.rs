@@ -12,6 +12,7 @@
 //! | modbus | a real Modbus device that dies and comes back |
 //! | neighbours | two cells on one machine |
 //! | watching | metrics, the document of the API, the live feed |
+//! | library | trials, labels, bundles, bombs and crowds of components |
 //! | guides | the commands in the documentation |
 //! | house | the rules of the source itself |
 
@@ -27,6 +28,7 @@ mod changes;
 mod guides;
 mod history;
 mod house;
+mod library;
 mod members;
 mod modbus;
 mod neighbours;

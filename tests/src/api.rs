@@ -215,6 +215,22 @@ impl Api {
         self.upload_bytes(&bytes)
     }
 
+    /// Uploads a test guest by name: one that its trial would keep out is taken in by force.
+    ///
+    /// # Errors
+    /// [`Error::File`], or as [`Api::ask`].
+    pub fn upload_guest(&self, name: &str) -> Result<Value, Error> {
+        let path = crate::components()?.join(format!("guests/{name}.wasm"));
+        let bytes = std::fs::read(&path).map_err(|source| Error::File {
+            path,
+            action: "read",
+            source,
+        })?;
+        let path = "/v1/components?force=true";
+        let answer = self.send("POST", path, &[("content-type", "application/wasm")], &bytes)?;
+        self.success("POST", path, &answer)
+    }
+
     /// Uploads stock controllers by name: `["pid", "pidplus"]`.
     ///
     /// # Errors

@@ -210,32 +210,39 @@ impl Intent {
     }
 }
 
+/// A plain specification for tests of this crate.
+#[cfg(test)]
+pub(crate) fn test_spec() -> LoopSpec {
+    use crate::{Digest, Mode, Policy, Strategy};
+    LoopSpec {
+        id: LoopId::new("level-1").expect("valid"),
+        revision: 99,
+        digest: Digest::of(b"pid"),
+        period_ns: 10_000_000,
+        ports: std::collections::BTreeMap::new(),
+        parameters: std::collections::BTreeMap::new(),
+        setpoint: 0.0,
+        setpoint_range: (0.0, 100.0),
+        mode: Mode::Automatic,
+        strategy: Strategy::Local,
+        replicas: 3,
+        limits: std::collections::BTreeMap::new(),
+        listens: Vec::new(),
+        fallback: None,
+        policy: Policy::default(),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used, reason = "tests")]
 
-    use std::collections::BTreeMap;
-
     use super::*;
-    use crate::{Digest, Mode, Policy, Strategy};
 
     fn spec(setpoint: f64) -> LoopSpec {
         LoopSpec {
-            id: LoopId::new("level-1").unwrap(),
-            revision: 99,
-            digest: Digest::of(b"pid"),
-            period_ns: 10_000_000,
-            ports: BTreeMap::new(),
-            parameters: BTreeMap::new(),
             setpoint,
-            setpoint_range: (0.0, 100.0),
-            mode: Mode::Automatic,
-            strategy: Strategy::Local,
-            replicas: 3,
-            limits: BTreeMap::new(),
-            listens: Vec::new(),
-            fallback: None,
-            policy: Policy::default(),
+            ..test_spec()
         }
     }
 

@@ -18,6 +18,8 @@ pub enum HandOver {
     Same,
     /// `migrate`, and `start` with what the actuators hold where it declines.
     Migrate,
+    /// `start` with what the actuators hold: the state speaks of other points.
+    Start,
 }
 
 /// What a change from `old` to `new` asks of the state.
@@ -25,9 +27,19 @@ pub enum HandOver {
 pub fn hand_over(old: &LoopSpec, new: &LoopSpec) -> HandOver {
     if old.digest == new.digest && old.parameters == new.parameters && old.ports == new.ports {
         HandOver::Same
+    } else if speaks_of_other_points(old, new) {
+        HandOver::Start
     } else {
         HandOver::Migrate
     }
+}
+
+/// A port that is connected elsewhere now, and, within one component, one that is connected or let go: what the state
+/// remembers of it would be taken for the new point's, and the output would jump by the difference. Ports that only one of
+/// two components has are no part of a state that the other understands.
+fn speaks_of_other_points(old: &LoopSpec, new: &LoopSpec) -> bool {
+    let moved = |(port, point)| old.ports.get(port).is_some_and(|before| before != point);
+    (old.digest == new.digest && old.ports != new.ports) || new.ports.iter().any(moved)
 }
 
 /// The bump of a switch, in % of span: how far the new outputs are from what the old controller would have sent in the
@@ -68,6 +80,37 @@ mod tests {
         assert_eq!(bump_percent(&[50.0, 5.0], &[50.5, 6.0], &[100.0, 10.0]), 10.0);
         assert_eq!(bump_percent(&[50.0], &[f64::NAN], &[100.0]), f64::INFINITY);
         assert_eq!(bump_percent(&[50.0], &[50.0, 1.0], &[100.0, 1.0]), f64::INFINITY);
+    }
+
+    #[test]
+    fn a_state_that_speaks_of_other_points_is_not_carried_over() {
+        let spec = |digest: &[u8], ports: &[(&str, &str)], k: f64| LoopSpec {
+            digest: crate::Digest::of(digest),
+            ports: ports
+                .iter()
+                .map(|(port, point)| ((*port).to_owned(), crate::PointId::new(point).expect("valid")))
+                .collect(),
+            parameters: [("k".to_owned(), k)].into(),
+            ..crate::intent::test_spec()
+        };
+        let pid = spec(b"pid", &[("pv", "p.1"), ("out", "p.2")], 1.0);
+        for (new, expected) in [
+            (pid.clone(), HandOver::Same),
+            (spec(b"pid", &[("pv", "p.1"), ("out", "p.2")], 2.0), HandOver::Migrate),
+            (spec(b"plus", &[("pv", "p.1"), ("out", "p.2")], 1.0), HandOver::Migrate),
+            (
+                spec(b"cascade", &[("pv", "p.1"), ("inner", "p.3"), ("out", "p.2")], 1.0),
+                HandOver::Migrate,
+            ),
+            (spec(b"pid", &[("pv", "p.3"), ("out", "p.2")], 1.0), HandOver::Start),
+            (spec(b"plus", &[("pv", "p.1"), ("out", "p.3")], 1.0), HandOver::Start),
+            (
+                spec(b"pid", &[("pv", "p.1"), ("ff", "p.3"), ("out", "p.2")], 1.0),
+                HandOver::Start,
+            ),
+        ] {
+            assert_eq!(hand_over(&pid, &new), expected, "{:?}", new.ports);
+        }
     }
 
     #[test]

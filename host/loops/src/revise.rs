@@ -36,6 +36,11 @@ pub(crate) fn take_over(
         .map(|state| (state, "start"))
 }
 
+/// The state to hand to `migrate`, where it speaks of the same points.
+fn carried<'a>(hand_over: swap::HandOver, from: &'a Origin, state: &'a [u8]) -> Option<(&'a Origin, &'a [u8])> {
+    (hand_over != swap::HandOver::Start).then_some((from, state))
+}
+
 /// What the actuators hold, with the safe value where that is not known.
 pub(crate) fn track(held: &HeldRevision, readings: &[Reading]) -> Vec<f64> {
     let values = held.wiring.held(readings);
@@ -96,7 +101,10 @@ impl Worker {
         let readings = seat.held[new]
             .wiring
             .remap(&running.frame.readings, &seat.held[old].wiring);
-        let from = origin(&seat.held[new]);
+        let (from, hand_over) = (
+            origin(&seat.held[new]),
+            swap::hand_over(&seat.held[new].spec, &seat.held[old].spec),
+        );
         let held = &mut seat.held[old];
         let limit_ns = held.spec.step_limit_ns();
         let actuators = track(held, &readings);
@@ -107,10 +115,14 @@ impl Worker {
         let began_ns = self.shared.now_ns();
         let step = match held.wiring.bad_input(&readings) {
             Some(port) => Err(missing_input(held, port)),
-            None => take_over(held, Some((&from, &running.state)), &actuators, limit_ns).and_then(|(state, _)| {
-                running.state = Arc::from(state);
-                held.instance.step(&frame, &running.state, limit_ns)
-            }),
+            None => {
+                let carried = carried(hand_over, &from, &running.state);
+                let taken = take_over(held, carried, &actuators, limit_ns);
+                taken.and_then(|(state, _)| {
+                    running.state = Arc::from(state);
+                    held.instance.step(&frame, &running.state, limit_ns)
+                })
+            }
         };
         let step_ns = self.shared.now_ns() - began_ns;
         running.events.push(CycleEvent::RolledBack {
@@ -142,12 +154,12 @@ impl Worker {
             return None;
         }
         let limit_percent = policy.probation_deviation_percent.unwrap_or(f64::INFINITY);
-        let from = origin(now);
+        let (from, hand_over) = (origin(now), swap::hand_over(&now.spec, &seat.held[old].spec));
         let readings = now.wiring.remap(&running.frame.readings, &seat.held[old].wiring);
         let before = &mut seat.held[old];
         let limit_ns = before.spec.step_limit_ns();
         let held = track(before, &readings);
-        let (state, _) = take_over(before, Some((&from, &running.state)), &held, limit_ns).ok()?;
+        let (state, _) = take_over(before, carried(hand_over, &from, &running.state), &held, limit_ns).ok()?;
         let frame = Frame {
             readings,
             ..running.frame.clone()
@@ -304,7 +316,7 @@ fn try_revision(
     let actuators = track(new, &readings);
     let (state, by): (Arc<[u8]>, _) = match hand_over {
         swap::HandOver::Same => (Arc::clone(&running.state), "same"),
-        swap::HandOver::Migrate => take_over(new, Some((&from, &running.state)), &actuators, limit_ns)
+        other => take_over(new, carried(other, &from, &running.state), &actuators, limit_ns)
             .map(|(state, by)| (Arc::from(state), by))
             .map_err(|fault| format!("no state could be made for the new component: {fault}"))?,
     };
