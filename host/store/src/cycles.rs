@@ -38,8 +38,12 @@ pub use cursor::{Cursor, Window};
 
 const CYCLES_FILE: &str = "cycles.redb";
 
-/// Least and greatest bound of the log, in bytes: below it a fast loop has no minute; beyond it a disk of its own is due.
+/// Least and greatest bound of the log's file, in bytes: below it a fast loop has no minute; beyond it a disk of its own is due.
 pub const BYTES_MAX: std::ops::RangeInclusive<u64> = 16 * 1024 * 1024..=65_536 * 1024 * 1024;
+
+/// How many times as large as its chunks the file becomes: the database grows by doubling, and keeps pages free to write
+/// into. Measured with a thousand loops over many times the bound.
+const DATABASE_TIMES: u64 = 2;
 
 /// Records that wait in the queue, between two looks of the thread: 160,000 a second.
 const QUEUE_MAX: usize = 16_384;
@@ -52,6 +56,9 @@ const GATHER_EVERY: Duration = Duration::from_millis(100);
 
 /// How often what was gathered goes to the disk: what a crash may cost.
 const WRITE_EVERY: Duration = Duration::from_secs(1);
+
+/// Pause after a write that failed: all that waits is compressed anew for the next try.
+const FAILED_PAUSE: Duration = Duration::from_secs(5);
 
 /// How often a failing disk is logged.
 const COMPLAIN_EVERY: Duration = Duration::from_secs(60);
@@ -75,7 +82,7 @@ pub struct CycleCounts {
     pub failed_writes: u64,
     /// Chunks that could not be read and were skipped; each read counts.
     pub damaged: u64,
-    /// Bytes of all chunks now.
+    /// Bytes of all chunks now; the file is up to twice as large.
     pub bytes: u64,
 }
 
@@ -123,8 +130,7 @@ pub struct CycleLog {
 }
 
 impl CycleLog {
-    /// Opens the log in the store's directory, and starts its thread. `bytes_max` bounds the chunks on disk; what the
-    /// database keeps free for itself comes on top, up to as much again.
+    /// Opens the log in the store's directory, and starts its thread. `bytes_max` bounds its file, about.
     ///
     /// # Errors
     /// [`Error::Size`] for a bound outside [`BYTES_MAX`], [`Error::Io`], [`Error::Database`], [`Error::Newer`].
@@ -136,11 +142,18 @@ impl CycleLog {
                 max: usize::try_from(*BYTES_MAX.end()).unwrap_or(usize::MAX),
             });
         }
-        Self::open_bounded(store, bytes_max)
+        Self::open_bounded(store, bytes_max / DATABASE_TIMES)
     }
 
+    /// As [`CycleLog::open`], with any bound of the chunks themselves.
     pub(crate) fn open_bounded(store: &Store, bytes_max: u64) -> Result<Self, Error> {
-        let opener = || -> Opener { Box::new(|builder, file| builder.create_with_backend(FileBackend::new(file)?)) };
+        Self::open_with(store, bytes_max, || {
+            Box::new(|builder, file| builder.create_with_backend(FileBackend::new(file)?))
+        })
+    }
+
+    /// The same, on any disk.
+    pub(crate) fn open_with(store: &Store, bytes_max: u64, opener: impl Fn() -> Opener) -> Result<Self, Error> {
         let path = store.directory().join(CYCLES_FILE);
         let shelf = match Shelf::open(&path, bytes_max, opener()) {
             Err(error @ (Error::Damaged { .. } | Error::NotAStore { .. })) => {
@@ -164,7 +177,7 @@ impl CycleLog {
             inner: Arc::clone(&inner),
             records,
             gathered: Gathered::new(),
-            written_at: Instant::now(),
+            write_at: Instant::now() + WRITE_EVERY,
             complained_at: None,
         };
         let thread = std::thread::Builder::new()
@@ -298,7 +311,7 @@ struct Writer {
     inner: Arc<Inner>,
     records: Receiver<Arc<Record>>,
     gathered: Gathered,
-    written_at: Instant,
+    write_at: Instant,
     complained_at: Option<Instant>,
 }
 
@@ -331,7 +344,7 @@ impl Writer {
                     return;
                 }
             }
-            if self.written_at.elapsed() >= WRITE_EVERY
+            if Instant::now() >= self.write_at
                 && let Err(error) = self.write()
             {
                 self.complain(&error);
@@ -353,7 +366,7 @@ impl Writer {
     }
 
     fn write(&mut self) -> Result<(), Error> {
-        self.written_at = Instant::now();
+        self.write_at = Instant::now() + WRITE_EVERY;
         if self.gathered.is_empty() {
             return Ok(());
         }
@@ -375,6 +388,7 @@ impl Writer {
             }
             Err(error) => {
                 counters.failed_writes.fetch_add(1, Ordering::Relaxed);
+                self.write_at = Instant::now() + FAILED_PAUSE;
                 Err(error)
             }
         }
@@ -429,6 +443,7 @@ fn pack(loop_id: &LoopId, waiting: &VecDeque<Arc<Record>>) -> Vec<Parcel> {
 fn parcel(loop_id: &LoopId, records: &[Arc<Record>]) -> Option<Parcel> {
     let (first, last) = (records.first()?, records.last()?);
     let head = Head {
+        number: 0,
         first: first.position(),
         last: last.position(),
         first_at_ns: first.at_ns,
@@ -449,8 +464,8 @@ fn parcel(loop_id: &LoopId, records: &[Arc<Record>]) -> Option<Parcel> {
 }
 
 /// Reads a chunk; one that cannot be read is counted, said once in the log, and none.
-fn unpack(inner: &Inner, loop_id: &LoopId, first: (u64, u64)) -> Result<Option<Vec<Arc<Record>>>, Error> {
-    let Some(bytes) = inner.shelf.chunk(loop_id, first)? else {
+fn unpack(inner: &Inner, loop_id: &LoopId, head: &Head) -> Result<Option<Vec<Arc<Record>>>, Error> {
+    let Some(bytes) = inner.shelf.chunk(head.number)? else {
         return Ok(None);
     };
     match chunk::decode(&bytes) {
@@ -458,7 +473,7 @@ fn unpack(inner: &Inner, loop_id: &LoopId, first: (u64, u64)) -> Result<Option<V
         Err(error) => {
             inner.counters.damaged.fetch_add(1, Ordering::Relaxed);
             let path: &Path = inner.shelf.path();
-            tracing::warn!(%loop_id, ?first, %error, path = %path.display(), "some recorded cycles cannot be read and are skipped");
+            tracing::warn!(%loop_id, first = ?head.first, %error, path = %path.display(), "some recorded cycles cannot be read and are skipped");
             Ok(None)
         }
     }

@@ -119,7 +119,7 @@ impl Cursor {
         loop {
             let piece = match self.heads.pop_front() {
                 Some(head) if head.first_at_ns > self.to_ns && head.last_at_ns > self.to_ns => continue,
-                Some(head) => match unpack(&self.inner, &self.loop_id, head.first)? {
+                Some(head) => match unpack(&self.inner, &self.loop_id, &head)? {
                     Some(records) => records,
                     None => {
                         self.unread += 1;

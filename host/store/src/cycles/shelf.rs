@@ -6,8 +6,8 @@
 //! | table | from | to |
 //! |---|---|---|
 //! | `heads` | loop, first position | [`Head`]: small, so that many can be looked through |
-//! | `chunks` | loop, first position | the bytes |
-//! | `ages` | number of the chunk, growing | its loop and first position |
+//! | `chunks` | number of the chunk, growing | the bytes: those of one second lie together, and go together |
+//! | `ages` | number of the chunk | its loop and first position |
 //! | `totals` | `bytes`, `next` | bytes of all chunks; number of the next one |
 
 use std::path::Path;
@@ -43,14 +43,16 @@ type Key<'a> = (&'a str, u64, u64);
 type HeadRow = (u64, u64, u64, u64, u64, u64, u64);
 
 const HEADS: TableDefinition<Key<'static>, HeadRow> = TableDefinition::new("heads");
-const CHUNKS: TableDefinition<Key<'static>, &[u8]> = TableDefinition::new("chunks");
+const CHUNKS: TableDefinition<u64, &[u8]> = TableDefinition::new("chunks");
 const AGES: TableDefinition<u64, Key<'static>> = TableDefinition::new("ages");
 const TOTALS: TableDefinition<&str, u64> = TableDefinition::new("totals");
 
 /// What is known of a chunk without reading it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Head {
-    /// Position of its first record: with the loop, its name.
+    /// Number of the chunk; given when it is put.
+    pub(super) number: u64,
+    /// Position of its first record.
     pub(super) first: (u64, u64),
     /// Position of its last record.
     pub(super) last: (u64, u64),
@@ -78,8 +80,9 @@ pub(super) struct Shelf {
 }
 
 fn head((term, seq): (u64, u64), row: HeadRow) -> Head {
-    let (_, last_term, last_seq, first_at_ns, last_at_ns, count, _) = row;
+    let (number, last_term, last_seq, first_at_ns, last_at_ns, count, _) = row;
     Head {
+        number,
         first: (term, seq),
         last: (last_term, last_seq),
         first_at_ns,
@@ -144,9 +147,10 @@ impl Shelf {
                 let replaced = heads.insert(key, row)?.map(|old| old.value());
                 if let Some((number, .., old_size)) = replaced {
                     ages.remove(number)?;
+                    chunks.remove(number)?;
                     bytes = bytes.saturating_sub(old_size);
                 }
-                chunks.insert(key, chunk.as_slice())?;
+                chunks.insert(next, chunk.as_slice())?;
                 ages.insert(next, key)?;
                 bytes += size;
                 next += 1;
@@ -155,15 +159,16 @@ impl Shelf {
                 if bytes <= self.bytes_max {
                     break;
                 }
-                let Some(oldest) = ages.pop_first()?.map(|(_, key)| {
+                let Some(oldest) = ages.pop_first()?.map(|(number, key)| {
                     let (loop_id, term, seq) = key.value();
-                    (loop_id.to_owned(), term, seq)
+                    (number.value(), loop_id.to_owned(), term, seq)
                 }) else {
                     break;
                 };
-                let key = (oldest.0.as_str(), oldest.1, oldest.2);
-                let size = heads.remove(key)?.map_or(0, |row| row.value().6);
-                chunks.remove(key)?;
+                let size = heads
+                    .remove((oldest.1.as_str(), oldest.2, oldest.3))?
+                    .map_or(0, |row| row.value().6);
+                chunks.remove(oldest.0)?;
                 bytes = bytes.saturating_sub(size);
             }
             totals.insert("bytes", bytes)?;
@@ -196,12 +201,12 @@ impl Shelf {
     }
 
     /// A chunk; none where it was thrown away meanwhile.
-    pub(super) fn chunk(&self, loop_id: &LoopId, first: (u64, u64)) -> Result<Option<Vec<u8>>, Error> {
+    pub(super) fn chunk(&self, number: u64) -> Result<Option<Vec<u8>>, Error> {
         self.base.read("read cycles from", |txn| {
             let Some(table) = maybe(txn.open_table(CHUNKS))? else {
                 return Ok(None);
             };
-            let row = table.get((loop_id.as_str(), first.0, first.1))?;
+            let row = table.get(number)?;
             Ok(row.map(|row| row.value().to_vec()))
         })
     }
@@ -248,12 +253,13 @@ impl Shelf {
 
     #[cfg(test)]
     pub(super) fn spoil(&self, loop_id: &LoopId, first: (u64, u64), spoil: impl Fn(&mut Vec<u8>)) {
-        let mut bytes = self.chunk(loop_id, first).unwrap().unwrap();
+        let heads = self.heads(loop_id, |_, _| true).unwrap();
+        let number = heads.iter().find(|head| head.first == first).unwrap().number;
+        let mut bytes = self.chunk(number).unwrap().unwrap();
         spoil(&mut bytes);
-        let key = (loop_id.as_str(), first.0, first.1);
         self.base
             .write("spoil", Durability::Immediate, |txn| {
-                txn.open_table(CHUNKS)?.insert(key, bytes.as_slice())?;
+                txn.open_table(CHUNKS)?.insert(number, bytes.as_slice())?;
                 Ok(Change::Keep(()))
             })
             .unwrap();
@@ -272,7 +278,7 @@ fn forget_some(txn: &WriteTransaction, id: &str) -> Result<(u64, usize), redb::E
     }
     for &(term, seq, number, size) in &going {
         heads.remove((id, term, seq))?;
-        chunks.remove((id, term, seq))?;
+        chunks.remove(number)?;
         ages.remove(number)?;
         bytes = bytes.saturating_sub(size);
     }

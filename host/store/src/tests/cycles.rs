@@ -132,6 +132,34 @@ fn the_oldest_of_all_loops_go_when_the_bound_is_reached() {
 }
 
 #[test]
+fn the_file_stays_within_what_was_asked() {
+    let dir = tempdir().unwrap();
+    let log = open(dir.path());
+    let mut seed = 1_u64;
+    // A hundred loops with states that do not compress: three times the bound in all.
+    for round in 0..150_u64 {
+        for number in 0..100 {
+            let mut record = (*record(&format!("loop-{number}"), 1, round + 1)).clone();
+            let state = (0..200).flat_map(|_| {
+                seed = seed.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
+                seed.to_be_bytes()
+            });
+            record.state = state.collect();
+            log.offer(Arc::new(record));
+        }
+        log.flush().unwrap();
+    }
+    let counts = log.counts();
+    assert_eq!((counts.written, counts.dropped), (15_000, 0));
+    assert!(
+        counts.bytes <= 8 * MIB && counts.bytes > 7 * MIB,
+        "the bound was reached: {counts:?}"
+    );
+    let file = std::fs::metadata(dir.path().join("cycles.redb")).unwrap().len();
+    assert!(file <= 17 * MIB, "{file}");
+}
+
+#[test]
 fn a_damaged_chunk_is_skipped_and_counted() {
     let dir = tempdir().unwrap();
     let log = open(dir.path());

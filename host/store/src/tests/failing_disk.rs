@@ -75,6 +75,51 @@ impl StorageBackend for Disk {
     }
 }
 
+fn opener(full: &Arc<AtomicBool>) -> crate::database::Opener {
+    let full = Arc::clone(full);
+    Box::new(move |builder: &redb::Builder, file| {
+        builder.create_with_backend(Disk {
+            file: FileBackend::new(file)?,
+            full: Arc::clone(&full),
+        })
+    })
+}
+
+#[test]
+fn cycles_wait_for_the_disk_and_come_after_it() {
+    let dir = tempdir().unwrap();
+    let full = Arc::new(AtomicBool::new(false));
+    let store = Store::open(dir.path()).unwrap();
+    let log = crate::CycleLog::open_with(&store, 1 << 24, || opener(&full)).unwrap();
+    let id = loop_id("level-1");
+    let seqs = |log: &crate::CycleLog| {
+        let mut cursor = log.read(&id, crate::Window::Last(100), false).unwrap();
+        let mut found = Vec::new();
+        while let Some(piece) = cursor.next_piece().unwrap() {
+            found.extend(piece.iter().map(|r| r.seq));
+        }
+        found
+    };
+    log.offer(record("level-1", 1, 1));
+    log.flush().unwrap();
+    full.store(true, Ordering::SeqCst);
+    log.offer(record("level-1", 1, 2));
+    let error = log.flush().unwrap_err().to_string();
+    assert!(
+        error.contains("cycles.redb: the disk is full, so free some space"),
+        "{error}"
+    );
+    log.offer(record("level-1", 1, 3));
+    assert!(log.flush().is_err());
+    full.store(false, Ordering::SeqCst);
+    assert_eq!(seqs(&log), [1, 2, 3], "what waits is read too");
+    log.flush().unwrap();
+    assert_eq!((log.counts().written, log.counts().dropped), (3, 0));
+    assert!(log.counts().failed_writes >= 2);
+    log.close().unwrap();
+    assert_eq!(seqs(&crate::CycleLog::open(&store, 1 << 24).unwrap()), [1, 2, 3]);
+}
+
 fn open(dir: &std::path::Path, full: &Arc<AtomicBool>) -> Store {
     let full = Arc::clone(full);
     let opener = move |builder: &redb::Builder, file| {
