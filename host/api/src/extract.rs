@@ -14,7 +14,7 @@ use serde::de::DeserializeOwned;
 
 use crate::{
     error::{Kind, Problem},
-    limits::{JSON_BYTES_MAX, NOTE_CHARS_MAX},
+    limits::{DISCARD_TIME_MAX, JSON_BYTES_MAX, NOTE_CHARS_MAX},
 };
 
 /// A JSON body of at most [`JSON_BYTES_MAX`].
@@ -134,6 +134,23 @@ pub(crate) async fn body_bytes(body: Body, bytes_max: usize) -> Result<Vec<u8>, 
         bytes.extend_from_slice(&piece);
     }
     Ok(bytes)
+}
+
+/// Reads a body to its end and keeps nothing, within bounds: whoever still sends when the connection is closed never sees the
+/// answer.
+pub(crate) async fn discard(body: Body, bytes_max: usize) {
+    let mut pieces = body.into_data_stream();
+    let all = async {
+        let mut bytes = 0;
+        while let Some(Ok(piece)) = pieces.next().await {
+            bytes += piece.len();
+            if bytes > bytes_max {
+                return;
+            }
+        }
+    };
+    // One that dawdles gets the answer as it is.
+    let _ = tokio::time::timeout(DISCARD_TIME_MAX, all).await;
 }
 
 /// A text for people from the query, else from a header; empty where there is neither.

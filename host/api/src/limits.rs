@@ -36,6 +36,9 @@ pub const CHANGE_TIME_MAX: Duration = Duration::from_secs(40);
 /// Longest time of an upload: a slow line, then at most 60 s in the compiler and 30 s of a trial, with others before it.
 pub const UPLOAD_TIME_MAX: Duration = Duration::from_secs(240);
 
+/// Longest time that the body of a refused upload is read for, so that the refusal arrives: 32 MiB over 50 Mbit/s.
+pub const DISCARD_TIME_MAX: Duration = Duration::from_secs(5);
+
 /// Longest time of a bundle: 64 components, each compiled and tried.
 pub const BUNDLE_TIME_MAX: Duration = Duration::from_secs(900);
 

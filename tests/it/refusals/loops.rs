@@ -1,6 +1,6 @@
 //! Loops and changes that cannot be right, and components that go wrong in service.
 
-use bumpless_tests::{Api, components, first_order_loop};
+use bumpless_tests::{Api, first_order_loop};
 use serde_json::{Value, json};
 
 use super::problem;
@@ -226,7 +226,6 @@ pub(super) fn bad_changes(api: &Api) {
 /// settled loop stays where it is.
 pub(super) fn misdeeds(api: &Api) {
     const LOOP: &str = "loop-1";
-    let folder = components().unwrap();
     let mut draft = first_order_loop(1, "pid", 50.0);
     api.apply(&draft).unwrap();
     settle(api, LOOP, 1.0);
@@ -240,7 +239,9 @@ pub(super) fn misdeeds(api: &Api) {
         "grows-memory",
     ];
     for guest in guests {
-        api.upload(&folder.join(format!("guests/{guest}.wasm"))).unwrap();
+        // Their trial would refuse them; what is told here is what happens if somebody insists.
+        let taken = api.upload_guest(guest).unwrap();
+        assert_eq!(taken["admission"]["verdict"], "forced", "{guest}");
         let before = api.loop_view(LOOP).unwrap();
         let done = api.swap(LOOP, guest);
         let then = with_pid_again(api, LOOP, guest);
@@ -250,7 +251,7 @@ pub(super) fn misdeeds(api: &Api) {
         }
     }
     // One that is good for a while, so that it comes into force, and traps in its probation.
-    api.upload(&folder.join("guests/jumps.wasm")).unwrap();
+    api.upload_guest("jumps").unwrap();
     let feed = api.live("?loops=loop-1").unwrap();
     draft["component"] = json!("jumps");
     draft["parameters"] = json!({ "after": 5 });

@@ -13,7 +13,7 @@ use utoipa::IntoParams;
 
 use crate::{
     error::{Kind, Problem},
-    extract::{InQuery, body_bytes, content_type, words},
+    extract::{InQuery, body_bytes, content_type, discard, words},
     limits::UPLOADS_MAX,
     server::{App, finish},
     types::Imports,
@@ -100,7 +100,13 @@ pub(crate) async fn import(
     content_type(&headers, &["application/x-tar", "application/octet-stream"])?;
     let by = words(query.by, &headers, "x-by")?;
     let by = if by.is_empty() { "api".to_owned() } else { by };
-    let _room = room(&app)?;
+    let _room = match room(&app) {
+        Ok(room) => room,
+        Err(busy) => {
+            discard(body, BUNDLE_BYTES_MAX).await;
+            return Err(busy);
+        }
+    };
     let bytes = body_bytes(body, BUNDLE_BYTES_MAX).await?;
     let ends = finish(app.cell.import(bytes, by, query.force)).await?;
     Ok(JsonAnswer(Imports {

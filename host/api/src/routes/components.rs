@@ -16,7 +16,7 @@ use utoipa::IntoParams;
 
 use crate::{
     error::{Kind, Problem},
-    extract::{InPath, InQuery, Json, body_bytes, content_type, words},
+    extract::{InPath, InQuery, Json, body_bytes, content_type, discard, words},
     server::{App, finish},
     types::{CallAnswer, CallRequest, Component, Components, RelabelRequest},
 };
@@ -146,14 +146,15 @@ pub(crate) async fn upload(
     let by = words(query.by, &headers, "x-by")?;
     let by = if by.is_empty() { "api".to_owned() } else { by };
     let labels = labels(query.labels.as_deref())?;
-    // Not even the first byte is read before there is room for all of them.
-    let _room = app.uploads.try_acquire().map_err(|_| {
-        Problem::new(
+    // Nothing is kept before there is room for all of it.
+    let Ok(_room) = app.uploads.try_acquire() else {
+        discard(body, COMPONENT_BYTES_MAX).await;
+        return Err(Problem::new(
             Kind::Busy,
             "too many uploads are under way",
             "try again in a few seconds",
-        )
-    })?;
+        ));
+    };
     let bytes = body_bytes(body, COMPONENT_BYTES_MAX).await?;
     if bytes.is_empty() {
         return Err(Problem::new(
