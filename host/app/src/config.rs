@@ -177,7 +177,7 @@ struct HistoryTable {
 
 impl Default for HistoryTable {
     fn default() -> Self {
-        // A day of ten loops at 10 Hz, about, and no surprise on a small disk.
+        // Hours of a dozen loops at 10 Hz, and no surprise on a small disk.
         Self {
             enabled: true,
             bytes_max_mib: 512,

@@ -2,9 +2,14 @@
 //!
 //! Never: for work that a cycle, or a person at a switch, waits for.
 
-use tokio::sync::oneshot;
+use std::time::Duration;
+
+use tokio::{sync::oneshot, time::timeout};
 
 use crate::error::Error;
+
+/// Longest wait for one piece of such work. It has milliseconds to do, on a machine that lets it.
+const ASIDE_WAIT: Duration = Duration::from_secs(25);
 
 /// Nice value of such threads; the compiling child has the same.
 const NICE: i32 = 19;
@@ -30,10 +35,10 @@ pub(crate) fn aside(name: &str, work: impl FnOnce() + Send + 'static) -> Result<
     })
 }
 
-/// Runs work on such a thread, and waits for its end.
+/// Runs work on such a thread, and waits for its end. Work that is not done in time goes on, but nobody waits for it.
 ///
 /// # Errors
-/// As [`aside`]; [`Error::Internal`] where the work panicked.
+/// As [`aside`]; [`Error::Timeout`], [`Error::Internal`] where the work panicked.
 pub(crate) async fn done_aside<T: Send + 'static>(
     name: &str,
     work: impl FnOnce() -> T + Send + 'static,
@@ -43,7 +48,15 @@ pub(crate) async fn done_aside<T: Send + 'static>(
         // The asker may have left.
         let _ = sender.send(work());
     })?;
-    receiver
-        .await
-        .map_err(|_| Error::internal(format!("{name} ended badly; the log says more")))
+    let late = |_| {
+        Error::timeout(
+            format!(
+                "a {name} at the lowest priority did not get far within {} s",
+                ASIDE_WAIT.as_secs()
+            ),
+            "the loop's home is too busy; try again later, or ask for less",
+        )
+    };
+    let ended = timeout(ASIDE_WAIT, receiver).await.map_err(late)?;
+    ended.map_err(|_| Error::internal(format!("a {name} ended badly; the log says more")))
 }

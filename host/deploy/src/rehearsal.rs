@@ -516,6 +516,95 @@ mod tests {
 
     use super::*;
 
+    fn output(port: &str, max_percent: f64) -> OutputReport {
+        OutputReport {
+            port: port.into(),
+            unit: String::new(),
+            span: 100.0,
+            max_percent,
+            max_at: (3, 7),
+            mean_percent: 0.0,
+            rms_percent: 0.0,
+            recorded_travel: 0.0,
+            candidate_travel: 0.0,
+        }
+    }
+
+    fn report(outputs: Vec<OutputReport>, compared: u64, equal: u64) -> TrialReport {
+        TrialReport {
+            loop_id: LoopId::new("l").unwrap(),
+            component: String::new(),
+            digest: bumpless_core::Digest::of(b""),
+            parameters: BTreeMap::new(),
+            dropped_parameters: vec![],
+            dropped_ports: vec![],
+            taken_over_by: None,
+            anchored_anew: 0,
+            from_ns: 0,
+            to_ns: 0,
+            cycles: 10,
+            compared,
+            equal,
+            held: 0,
+            faults: 0,
+            first_fault: None,
+            skipped: vec![],
+            bump_percent: None,
+            bump_limit_percent: 5.0,
+            outputs,
+            steps: StepTimes::default(),
+            indices: IndexReport::default(),
+            verdict: None,
+            reason: String::new(),
+            measured_port: None,
+            measured_unit: String::new(),
+            cycles_per_point: 1,
+            points: vec![],
+            unread: 0,
+            stopped_early: None,
+        }
+    }
+
+    #[test]
+    fn verdicts_follow_the_worst_output_and_a_fault_is_worse_than_any() {
+        let both = |worst| vec![output("a", 0.001), output("b", worst)];
+        let mut faulty = report(both(0.0), 9, 9);
+        (faulty.faults, faulty.first_fault) = (
+            1,
+            Some(Finding {
+                position: (2, 5),
+                text: "it trapped".into(),
+            }),
+        );
+        let table = [
+            (report(both(0.0), 9, 9), Some(Verdict::Same), "equal to the last bit"),
+            (report(both(0.01), 9, 8), Some(Verdict::Same), "1.00e-2 %"),
+            (report(both(4.9), 9, 8), Some(Verdict::Close), "b is at most 4.900 %"),
+            (
+                report(both(5.1), 9, 8),
+                Some(Verdict::Differs),
+                "b is up to 5.100 % of its span away, in cycle 7 of term 3",
+            ),
+            (
+                report(both(f64::INFINITY), 9, 8),
+                Some(Verdict::Differs),
+                "b is up to inf %",
+            ),
+            (report(both(0.0), 0, 0), None, "no cycle could be compared"),
+            (report(vec![], 9, 9), None, "no cycle could be compared"),
+            (
+                faulty,
+                Some(Verdict::Fails),
+                "faulted in 1 of 10 cycles, first in cycle 5 of term 2: it trapped",
+            ),
+        ];
+        for (report, verdict, part) in table {
+            let (found, reason) = judged(&report);
+            assert_eq!(found, verdict, "{reason}");
+            assert!(reason.contains(part), "{part}: {reason}");
+        }
+    }
+
     #[test]
     fn times_are_ranks() {
         assert_eq!(times(&[]), StepTimes::default());

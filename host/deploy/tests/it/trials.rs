@@ -144,6 +144,113 @@ async fn what_was_recorded_can_be_repeated_to_the_bit() {
     real.stop().await;
 }
 
+/// Puts other records in the place of those that were recorded.
+fn rewrite(real: &Real, l: &LoopId, records: &[Record]) {
+    real.cycles.forget(l).unwrap();
+    records
+        .iter()
+        .for_each(|record| real.cycles.offer(Arc::new(record.clone())));
+    real.cycles.flush().unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_was_tampered_with_is_found_and_gaps_are_gone_over() {
+    let (cell, disk) = (Cell::new(), tempfile::tempdir().unwrap());
+    let real = running(&cell, &disk.path().join("io")).await;
+    let (deploy, l) = (&real.deploy, id("l"));
+    cycles_pass(deploy, &l, 30).await;
+    // From here on the loop has its next cycle in an hour, at a time of the hour that its name decides.
+    let mut slow = draft("l", "pid", "io", 0);
+    slow.period_ms = 3_600_000.0;
+    slow.parameters = BTreeMap::from([("ti".to_owned(), 5.0), ("k".to_owned(), 0.8)]);
+    deploy.apply(slow).await.unwrap();
+    let all = Window::Last(100_000);
+    let good = deploy.cycles(&l, all, 1_000).await.unwrap().records;
+    assert!(good.len() > 20, "{}", good.len());
+    let whole = deploy.replay(&l, all).await.unwrap();
+    assert!(whole.first_difference.is_none() && whole.compared > 15, "{whole:?}");
+
+    type Tamper = fn(&mut Record);
+    let table: [(Tamper, &str, u64); 6] = [
+        (|r| r.wanted[0] += 1e-12, "output out was", 1),
+        // The step after it goes on from there, and comes out otherwise as well.
+        (
+            |r| {
+                let mut bytes = r.state.to_vec();
+                bytes[20] ^= 1;
+                r.state = Arc::from(bytes);
+            },
+            "the state after it differs from byte 20 on",
+            2,
+        ),
+        (
+            |r| r.state = Arc::from(&r.state[..r.state.len() - 1]),
+            "bytes, and has",
+            2,
+        ),
+        (|r| r.setpoint += 1.0, "output out was", 1),
+        (
+            |r| {
+                r.messages.push(bumpless_core::Message {
+                    topic: "t".into(),
+                    data: vec![1],
+                });
+            },
+            "its messages differ",
+            1,
+        ),
+        (
+            |r| {
+                r.log.push(bumpless_core::LogLine {
+                    level: bumpless_core::LogLevel::Info,
+                    text: "x".into(),
+                });
+            },
+            "its log lines differ",
+            1,
+        ),
+    ];
+    for (tamper, part, differ) in table {
+        let mut bad = good.clone();
+        tamper(&mut bad[10]);
+        rewrite(&real, &l, &bad);
+        let report = deploy.replay(&l, all).await.unwrap();
+        let found = report.first_difference.expect(part);
+        assert_eq!(found.position, good[10].position(), "{part}");
+        assert!(found.text.contains(part), "{part}: {}", found.text);
+        assert_eq!(report.compared - report.equal, differ, "{part}");
+        assert_eq!(report.compared, whole.compared);
+    }
+
+    // Three cycles are missing: one more is only gone on from.
+    let mut holed = good.clone();
+    holed.drain(8..11);
+    rewrite(&real, &l, &holed);
+    let report = deploy.replay(&l, all).await.unwrap();
+    assert_eq!(
+        (report.compared, report.equal),
+        (whole.compared - 4, whole.compared - 4)
+    );
+    let gaps = report
+        .skipped
+        .iter()
+        .find(|s| s.reason == "the record before it is missing");
+    assert_eq!(gaps.map(|s| s.cycles), Some(1), "{report:?}");
+    let plus = backtest(deploy, &l, trial("pidplus", &[]), all).await;
+    assert_eq!((plus.anchored_anew, plus.faults), (1, 0), "{plus:?}");
+    assert_eq!(
+        plus.cycles as usize,
+        holed.len() - 2,
+        "the first, and the first after the gap, are only gone on from"
+    );
+    assert!(
+        matches!(plus.verdict, Some(Verdict::Same | Verdict::Close)),
+        "{}",
+        plus.reason
+    );
+    real.stop().await;
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn candidates_are_judged_on_recorded_cycles() {
     let (cell, disk) = (Cell::new(), tempfile::tempdir().unwrap());
