@@ -3,6 +3,7 @@
 use std::{
     path::Path,
     process::{Output, Stdio},
+    time::Duration,
 };
 
 use bumpless_tests::{Api, Binary, Cell, CellOptions, components};
@@ -181,6 +182,38 @@ fn components_are_tried_labelled_and_carried_from_cell_to_cell() {
     assert_eq!(api.components().unwrap().len(), 2);
 }
 
+/// A compiling child that has taken its own rights away.
+#[derive(Debug)]
+struct Confined {
+    threads: u64,
+    /// Greatest address space in bytes, as the kernel says it.
+    address_space: String,
+}
+
+/// The child of a host that has the lowest priority, if there is one.
+fn confined(host: u32) -> Option<Confined> {
+    let processes = std::fs::read_dir("/proc").unwrap().flatten();
+    processes
+        .filter_map(|entry| entry.file_name().to_str()?.parse::<u32>().ok())
+        .find_map(|pid| {
+            let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
+            // Behind the name in brackets: state, parent; nice is the 17th and the number of threads the 18th.
+            let fields: Vec<&str> = stat.rsplit_once(')')?.1.split_whitespace().collect();
+            let (parent, nice, threads) = (fields.get(1)?, fields.get(16)?, fields.get(17)?);
+            if **parent != *host.to_string() || **nice != *"19" {
+                return None;
+            }
+            let limits = std::fs::read_to_string(format!("/proc/{pid}/limits")).ok()?;
+            let line = limits.lines().find(|line| line.starts_with("Max address space"))?;
+            let address_space = line.split_whitespace().nth(3)?.to_owned();
+            // It sets the limits right after its priority.
+            (address_space != "unlimited").then(|| Confined {
+                threads: threads.parse().unwrap_or(u64::MAX),
+                address_space,
+            })
+        })
+}
+
 /// A number in LEB128.
 fn leb(mut number: usize) -> Vec<u8> {
     let mut bytes = Vec::new();
@@ -228,8 +261,19 @@ fn bombs_and_crowds_are_refused_and_the_loops_go_on() {
     let before = api
         .wait_for_loop("loop-0", "cycles", |view| view["seq"].is_u64())
         .unwrap();
-    // Minutes of compilation, of which it gets some seconds.
-    let error = api.upload_bytes(&bomb(400_000)).unwrap_err();
+    // Minutes of compilation, of which it gets some seconds, in a process that everything else goes before.
+    let host = cell.plant.pid().unwrap();
+    let error = std::thread::scope(|scope| {
+        let upload = scope.spawn(|| api.upload_bytes(&bomb(400_000)).unwrap_err());
+        let child = bumpless_tests::wait_until("the compiling child", Duration::from_secs(60), || {
+            confined(host).ok_or("none that has lowered its priority")
+        })
+        .unwrap();
+        assert!(child.threads <= 5, "it leaves cores to the cycles: {child:?}");
+        assert_eq!(child.address_space, "2147483648", "{child:?}");
+        upload.join().unwrap()
+    });
+    assert!(confined(host).is_none(), "the child is gone");
     assert_eq!(error.status(), 422, "{error}");
     assert!(error.to_string().contains("longer than 15 s"), "{error}");
     // A hundred at once: the same bytes but for a section that says nothing, so that one alone may come in.

@@ -281,7 +281,7 @@ impl Run<'_> {
                 }
                 self.wrote |= !effects.writes.is_empty();
                 self.trial.state_bytes = self.trial.state_bytes.max(effects.state.len() as u64);
-                if effects.log.len() >= LOG_LINES_PER_STEP_MAX && self.told.insert((kind, u8::MAX)) {
+                if effects.log.len() >= LOG_LINES_PER_STEP_MAX && self.told.insert((Kind::Rest, u8::MAX)) {
                     self.find(
                         Severity::Warning,
                         format!(
