@@ -70,7 +70,9 @@ fn replays_are_equal_candidates_are_judged_and_a_shadow_outlives_the_owner() {
     );
     assert_eq!(
         (&end["report"]["faults"], &end["report"]["taken_over_by"]),
-        (&json!(0), &json!("migrate"))
+        (&json!(0), &json!("migrate")),
+        "{}",
+        end["report"]["first_fault"]
     );
     let after = api
         .wait_for_loop(LOOP, "another owner", |view| view["owner"] != json!(owner))

@@ -101,7 +101,8 @@ pub async fn run(config: Config) -> Result<Running, Error> {
         .await?
         .map_err(|e| Error::start("the store", e))?;
     let writer = RecordWriter::start(store.clone()).map_err(|e| Error::start("the record writer", e))?;
-    let (log_of, bytes_max) = (store.clone(), config.history_bytes_max);
+    // Cycles are recorded at the loops' homes, and only a host with points is one.
+    let (log_of, bytes_max) = (store.clone(), config.history_bytes_max.filter(|_| config.io));
     let cycles = blocking(move || {
         bytes_max
             .map(|bytes_max| CycleLog::open(&log_of, bytes_max))

@@ -16,7 +16,7 @@
 //!
 //! Reading order: `draft`, `view`, `error` (what people see); `wire`, `field` (what this room speaks); `plan` (pure);
 //! `book`, `library`, `roster`, `feed` (what it keeps); `admission`, `bench`, `holder`, `home`, `change`, `orders` (what it does);
-//! `trials` with `rehearsal`, `replay`, `shadows`, `curve`, `report` (looking back, and trying candidates);
+//! `trials` with `rehearsal`, `verdict`, `replay`, `shadows`, `curve`, `report` (looking back, and trying candidates);
 //! `sync`, `answers`, `service`, `room`, `deploy` (how it hangs together).
 
 mod admission;
@@ -45,6 +45,7 @@ mod shadows;
 mod sync;
 mod trials;
 mod uploads;
+mod verdict;
 mod wire;
 
 pub mod draft;

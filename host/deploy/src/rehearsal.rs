@@ -19,14 +19,17 @@ use bumpless_core::{
 };
 use bumpless_engine::{Instance, Origin};
 use bumpless_loops::HeldRevision;
+use rustix::time::{ClockId, clock_gettime};
 
 use crate::{
     curve::Curve,
-    report::{CurvePoint, Finding, IndexReport, OutputReport, Skipped, StepTimes, TrialReport, Verdict},
+    report::{CurvePoint, Finding, IndexReport, OutputReport, Skipped, TrialReport},
+    verdict::{judged, times},
 };
 
-/// Differences up to this, in % of span, count as none.
-const SAME_PERCENT: f64 = 0.01;
+/// A candidate that spins is stopped after this time by the clock, in ns. The loop's own limit is held against the processor
+/// time that a step used: at the lowest priority, the clock says more of the machine than of the candidate.
+const STOP_NS: u64 = 100_000_000;
 
 /// Different reasons for leaving cycles out that are told apart; the rest is one.
 const REASONS_MAX: usize = 16;
@@ -135,7 +138,7 @@ pub(crate) struct Rehearsal {
     passed: Passed,
     bump_percent: Option<f64>,
     pairs: Vec<Pair>,
-    /// Of each good step, in ns; longer than 4 s counts as that.
+    /// Processor time of each good step, in ns; longer than 4 s counts as that.
     steps_ns: Vec<u32>,
     measured: Option<usize>,
     indices: Indices,
@@ -268,10 +271,20 @@ impl Rehearsal {
         };
         let candidate = &mut self.candidate.held;
         let limit_ns = candidate.spec.step_limit_ns();
-        match candidate.instance.step(&frame(record, readings), &state, limit_ns) {
+        let began_ns = processor_ns();
+        let stepped = candidate
+            .instance
+            .step(&frame(record, readings), &state, STOP_NS.max(limit_ns));
+        let used_ns = processor_ns().saturating_sub(began_ns);
+        let in_time = |effects| match used_ns {
+            used_ns if used_ns > limit_ns => Err(Fault::Overrun {
+                limit_us: limit_ns / 1_000,
+            }),
+            _ => Ok(effects),
+        };
+        match stepped.and_then(in_time) {
             Ok(effects) => {
-                self.steps_ns
-                    .push(u32::try_from(candidate.instance.last_step_ns()).unwrap_or(u32::MAX));
+                self.steps_ns.push(u32::try_from(used_ns).unwrap_or(u32::MAX));
                 self.wanted = candidate.wiring.wanted(&effects.writes, &self.wanted);
                 self.state = Some(effects.state);
                 Ok(first.then_some(held))
@@ -434,7 +447,7 @@ fn take_over(
     state: &[u8],
     track: &[f64],
 ) -> Result<(Vec<u8>, &'static str), Fault> {
-    let limit_ns = held.spec.step_limit_ns();
+    let limit_ns = STOP_NS.max(held.spec.step_limit_ns());
     let (instance, parameters): (&mut Instance, _) = (&mut held.instance, &held.wiring.parameters);
     if let Some(from) = from.filter(|_| !state.is_empty()) {
         if swap::hand_over(&from.spec, &held.spec) == HandOver::Same {
@@ -454,165 +467,18 @@ fn take_over(
         .map(|state| (state, "start"))
 }
 
-fn times(steps_ns: &[u32]) -> StepTimes {
-    let mut sorted = steps_ns.to_vec();
-    sorted.sort_unstable();
-    // The nearest rank: a time that really was.
-    let at = |part: f64| {
-        let rank = (sorted.len() as f64 * part).ceil() as usize;
-        sorted
-            .get(rank.saturating_sub(1))
-            .map_or(0.0, |ns| f64::from(*ns) / 1e3)
-    };
-    StepTimes {
-        p50_us: at(0.5),
-        p99_us: at(0.99),
-        worst_us: at(1.0),
-    }
-}
-
-/// The verdict and its reason. A fault weighs more than any likeness.
-fn judged(report: &TrialReport) -> (Option<Verdict>, String) {
-    let worst = report
-        .outputs
-        .iter()
-        .max_by(|a, b| a.max_percent.total_cmp(&b.max_percent));
-    if let Some(fault) = &report.first_fault {
-        let (term, seq) = fault.position;
-        let reason = format!(
-            "it faulted in {} of {} cycles, first in cycle {seq} of term {term}: {}",
-            report.faults, report.cycles, fault.text
-        );
-        return (Some(Verdict::Fails), reason);
-    }
-    let (Some(worst), 1..) = (worst, report.compared) else {
-        return (None, "no cycle could be compared".to_owned());
-    };
-    let limit = report.bump_limit_percent;
-    let (term, seq) = worst.max_at;
-    let (port, percent) = (&worst.port, worst.max_percent);
-    if report.equal == report.compared {
-        let reason = format!("all outputs of {} cycles are equal to the last bit", report.compared);
-        (Some(Verdict::Same), reason)
-    } else if percent <= SAME_PERCENT {
-        let reason = format!("no output is farther away than {percent:.2e} % of its span");
-        (Some(Verdict::Same), reason)
-    } else if percent <= limit {
-        let reason = format!(
-            "{port} is at most {percent:.3} % of its span away, in cycle {seq} of term {term}; a swap may step by {limit} %"
-        );
-        (Some(Verdict::Close), reason)
-    } else {
-        let reason = format!(
-            "{port} is up to {percent:.3} % of its span away, in cycle {seq} of term {term}; a swap may step by {limit} %"
-        );
-        (Some(Verdict::Differs), reason)
-    }
+/// Processor time of this thread so far, in ns.
+fn processor_ns() -> u64 {
+    let time = clock_gettime(ClockId::ThreadCPUTime);
+    let part = |value: i64| u64::try_from(value).unwrap_or_default();
+    part(time.tv_sec)
+        .saturating_mul(1_000_000_000)
+        .saturating_add(part(time.tv_nsec))
 }
 
 #[cfg(test)]
 mod tests {
-    #![allow(clippy::unwrap_used, reason = "tests")]
-
     use super::*;
-
-    fn output(port: &str, max_percent: f64) -> OutputReport {
-        OutputReport {
-            port: port.into(),
-            unit: String::new(),
-            span: 100.0,
-            max_percent,
-            max_at: (3, 7),
-            mean_percent: 0.0,
-            rms_percent: 0.0,
-            recorded_travel: 0.0,
-            candidate_travel: 0.0,
-        }
-    }
-
-    fn report(outputs: Vec<OutputReport>, compared: u64, equal: u64) -> TrialReport {
-        TrialReport {
-            loop_id: LoopId::new("l").unwrap(),
-            component: String::new(),
-            digest: bumpless_core::Digest::of(b""),
-            parameters: BTreeMap::new(),
-            dropped_parameters: vec![],
-            dropped_ports: vec![],
-            taken_over_by: None,
-            anchored_anew: 0,
-            from_ns: 0,
-            to_ns: 0,
-            cycles: 10,
-            compared,
-            equal,
-            held: 0,
-            faults: 0,
-            first_fault: None,
-            skipped: vec![],
-            bump_percent: None,
-            bump_limit_percent: 5.0,
-            outputs,
-            steps: StepTimes::default(),
-            indices: IndexReport::default(),
-            verdict: None,
-            reason: String::new(),
-            measured_port: None,
-            measured_unit: String::new(),
-            cycles_per_point: 1,
-            points: vec![],
-            unread: 0,
-            stopped_early: None,
-        }
-    }
-
-    #[test]
-    fn verdicts_follow_the_worst_output_and_a_fault_is_worse_than_any() {
-        let both = |worst| vec![output("a", 0.001), output("b", worst)];
-        let mut faulty = report(both(0.0), 9, 9);
-        (faulty.faults, faulty.first_fault) = (
-            1,
-            Some(Finding {
-                position: (2, 5),
-                text: "it trapped".into(),
-            }),
-        );
-        let table = [
-            (report(both(0.0), 9, 9), Some(Verdict::Same), "equal to the last bit"),
-            (report(both(0.01), 9, 8), Some(Verdict::Same), "1.00e-2 %"),
-            (report(both(4.9), 9, 8), Some(Verdict::Close), "b is at most 4.900 %"),
-            (
-                report(both(5.1), 9, 8),
-                Some(Verdict::Differs),
-                "b is up to 5.100 % of its span away, in cycle 7 of term 3",
-            ),
-            (
-                report(both(f64::INFINITY), 9, 8),
-                Some(Verdict::Differs),
-                "b is up to inf %",
-            ),
-            (report(both(0.0), 0, 0), None, "no cycle could be compared"),
-            (report(vec![], 9, 9), None, "no cycle could be compared"),
-            (
-                faulty,
-                Some(Verdict::Fails),
-                "faulted in 1 of 10 cycles, first in cycle 5 of term 2: it trapped",
-            ),
-        ];
-        for (report, verdict, part) in table {
-            let (found, reason) = judged(&report);
-            assert_eq!(found, verdict, "{reason}");
-            assert!(reason.contains(part), "{part}: {reason}");
-        }
-    }
-
-    #[test]
-    fn times_are_ranks() {
-        assert_eq!(times(&[]), StepTimes::default());
-        let hundred: Vec<u32> = (1..=100).rev().map(|us| us * 1000).collect();
-        let told = times(&hundred);
-        assert_eq!((told.p50_us, told.p99_us, told.worst_us), (50.0, 99.0, 100.0));
-        assert_eq!(times(&[7_000]).p50_us, 7.0);
-    }
 
     #[test]
     fn reasons_are_counted_and_their_number_is_bounded() {

@@ -84,7 +84,8 @@ pub enum Verdict {
     Fails,
 }
 
-/// Times of the candidate's steps, in µs.
+/// Processor time of the candidate's steps, in µs. The same components take a little longer in a loop, where more goes on
+/// between two steps.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct StepTimes {
     /// Half of the steps took at most this.

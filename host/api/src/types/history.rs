@@ -150,7 +150,7 @@ pub struct OutputTrial {
     pub candidate_travel: Option<f64>,
 }
 
-/// Times of the candidate's steps, in µs.
+/// Processor time of the candidate's steps, in µs.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct StepTimes {
     /// Half of the steps took at most this.

@@ -324,7 +324,7 @@ fn report(trial: &Trial) -> Result<(), Error> {
         show::number(trial.bump_limit_percent)
     ))?;
     show::line(&format!(
-        "  a step took {} µs, 99 of 100 at most {} µs, the longest {} µs",
+        "  a step took {} µs of the processor, 99 of 100 at most {} µs, the longest {} µs",
         show::number(trial.steps.p50_us),
         show::number(trial.steps.p99_us),
         show::number(trial.steps.worst_us)
