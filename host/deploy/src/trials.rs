@@ -112,10 +112,14 @@ impl Room {
         }
     }
 
-    /// Throws away what is recorded of loops that are not here any more. Blocks.
+    /// Throws away what is recorded of loops that were deleted, or moved elsewhere, before that could be done. Blocks. A loop
+    /// that is only not known yet keeps it: its intent may still come from another host.
     pub(crate) fn forget_strangers(&self) {
         let Some(cycles) = &self.cycles else { return };
-        let strange = |id: &LoopId| self.book.get(id).is_none_or(|intent| intent.home != self.here);
+        let strange = |id: &LoopId| match self.book.get(id) {
+            Some(intent) => intent.home != self.here,
+            None => self.store.last_removed_revision(id).is_ok_and(|revision| revision > 0),
+        };
         let forgotten = cycles.loops().and_then(|loops| {
             loops
                 .iter()

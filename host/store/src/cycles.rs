@@ -9,11 +9,12 @@
 //!                         ▲                        │
 //!                         └─────write failed───────┘      (until the memory for what waits is full)
 //! ```
+//! A record that goes on from none begins a loop's life: what an earlier loop of that name left is thrown away first.
 //! After a crash at most the last second is missing. A damaged chunk is skipped and counted. A damaged file is moved
 //! aside, for a log must not keep a host from starting.
 
 use std::{
-    collections::{BTreeMap, VecDeque},
+    collections::{BTreeMap, BTreeSet, VecDeque},
     path::Path,
     sync::{
         Arc,
@@ -111,7 +112,7 @@ type Gathered = BTreeMap<LoopId, VecDeque<Arc<Record>>>;
 
 enum Request {
     /// What waits of a loop.
-    Tail(LoopId, SyncSender<Vec<Arc<Record>>>),
+    Tail(LoopId, SyncSender<Result<Vec<Arc<Record>>, Error>>),
     /// Bring everything to the disk and say how it went.
     Flush(SyncSender<Result<(), Error>>),
     /// Throw a loop's records away.
@@ -177,6 +178,7 @@ impl CycleLog {
             inner: Arc::clone(&inner),
             records,
             gathered: Gathered::new(),
+            begun: BTreeSet::new(),
             write_at: Instant::now() + WRITE_EVERY,
             complained_at: None,
         };
@@ -217,7 +219,7 @@ impl CycleLog {
     /// [`Error::Slow`], [`Error::Io`], [`Error::Database`].
     pub fn read(&self, loop_id: &LoopId, window: Window, before: bool) -> Result<Cursor, Error> {
         // What waits first: what goes to the disk meanwhile is then in both, and not in neither.
-        let tail = self.ask(|answer| Request::Tail(loop_id.clone(), answer))?;
+        let tail = self.ask(|answer| Request::Tail(loop_id.clone(), answer))??;
         Cursor::new(Arc::clone(&self.inner), loop_id.clone(), tail, window, before)
     }
 
@@ -311,6 +313,8 @@ struct Writer {
     inner: Arc<Inner>,
     records: Receiver<Arc<Record>>,
     gathered: Gathered,
+    /// Loops whose first record waits: nothing older of their name may stay.
+    begun: BTreeSet<LoopId>,
     write_at: Instant,
     complained_at: Option<Instant>,
 }
@@ -324,8 +328,14 @@ impl Writer {
                 Err(RecvTimeoutError::Timeout) => {}
                 // Nobody may be waiting for an answer any more; what was asked is done either way.
                 Ok(Request::Tail(loop_id, answer)) => {
+                    // What is on disk of an earlier life must not be read before this one.
+                    let ready = if self.begun.contains(&loop_id) {
+                        self.write()
+                    } else {
+                        Ok(())
+                    };
                     let tail = self.gathered.get(&loop_id).into_iter().flatten().cloned().collect();
-                    let _ = answer.try_send(tail);
+                    let _ = answer.try_send(ready.map(|()| tail));
                 }
                 Ok(Request::Flush(answer)) => {
                     let _ = answer.try_send(self.write());
@@ -357,6 +367,10 @@ impl Writer {
         // At most one queue full, so that a flood cannot keep the thread from writing.
         for record in self.records.try_iter().take(QUEUE_MAX) {
             let waiting = self.gathered.entry(record.loop_id.clone()).or_default();
+            if record.after == (0, 0) {
+                self.begun.insert(record.loop_id.clone());
+                waiting.drain(..).for_each(|old| release(&self.inner.counters, &old));
+            }
             if waiting.back().is_none_or(|last| last.position() < record.position()) {
                 waiting.push_back(record);
             } else {
@@ -371,6 +385,13 @@ impl Writer {
             return Ok(());
         }
         let counters = &self.inner.counters;
+        while let Some(loop_id) = self.begun.first() {
+            self.inner.shelf.forget(loop_id.as_str()).inspect_err(|_| {
+                counters.failed_writes.fetch_add(1, Ordering::Relaxed);
+                self.write_at = Instant::now() + FAILED_PAUSE;
+            })?;
+            self.begun.pop_first();
+        }
         let parcels = self
             .gathered
             .iter()
@@ -395,6 +416,7 @@ impl Writer {
     }
 
     fn forget(&mut self, loop_id: &LoopId) -> Result<(), Error> {
+        self.begun.remove(loop_id);
         for record in self.gathered.remove(loop_id).into_iter().flatten() {
             release(&self.inner.counters, &record);
         }

@@ -182,6 +182,30 @@ fn a_damaged_chunk_is_skipped_and_counted() {
 }
 
 #[test]
+fn a_loop_that_begins_anew_leaves_its_namesake_behind() {
+    let dir = tempdir().unwrap();
+    let log = open(dir.path());
+    let id = loop_id("level-1");
+    for seq in 1..=5 {
+        log.offer(record("level-1", 9, seq));
+        log.offer(record("flow-1", 9, seq));
+    }
+    log.flush().unwrap();
+    log.offer(record("level-1", 9, 6));
+    let mut first = (*record("level-1", 1, 1)).clone();
+    first.after = (0, 0);
+    log.offer(Arc::new(first));
+    log.offer(record("level-1", 1, 2));
+    assert_eq!(seqs(&log, &id, Window::Last(100), false), [1, 2]);
+    log.flush().unwrap();
+    assert_eq!(seqs(&log, &id, Window::Last(100), false), [1, 2]);
+    assert_eq!(
+        seqs(&log, &loop_id("flow-1"), Window::Last(100), false),
+        [1, 2, 3, 4, 5]
+    );
+}
+
+#[test]
 fn a_file_that_is_no_log_is_moved_aside() {
     let dir = tempdir().unwrap();
     drop(Store::open(dir.path()).unwrap());
