@@ -89,7 +89,7 @@ impl Cascade {
     }
 
     /// New tunings, outer and inner each: the output goes on without a bump.
-    pub const fn retune(&mut self, old: &(Tuning, Tuning), new: &(Tuning, Tuning)) {
+    pub fn retune(&mut self, old: &(Tuning, Tuning), new: &(Tuning, Tuning)) {
         self.outer.retune(&old.0, &new.0);
         self.inner.retune(&old.1, &new.1);
     }

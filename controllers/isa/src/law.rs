@@ -205,7 +205,11 @@ impl Memory {
     /// Moves the integral so that the output under the new tuning is, for the last sample, what it was under the old.
     ///
     /// D keeps its size, and fades or grows to its new one with its filter; where it is switched off, the integral takes it.
-    pub const fn retune(&mut self, old: &Tuning, new: &Tuning) {
+    pub fn retune(&mut self, old: &Tuning, new: &Tuning) {
+        // The way through the output rounds; without a change nothing may differ, not even in the last bit.
+        if old == new {
+            return;
+        }
         let wanted = self.integral + self.rest(old);
         let has_derivative = new.td_s > 0.0 && new.gain != 0.0;
         self.derivative = if has_derivative {

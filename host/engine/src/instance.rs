@@ -39,8 +39,9 @@ pub struct Origin {
 
 /// An instance of a component. It can move between threads, and each thread that calls it needs 1 MiB of stack.
 ///
-/// `limit_ns` bounds each call by the clock; a guest that goes on is stopped once it has used half a tick of processor time
-/// beyond it: at most 2 ms later on an idle machine, and never because the machine held it up. A call that ends between its limit and the tick is good.
+/// `limit_ns` bounds each call by the clock; a guest that goes on is stopped once it has used a quarter of the limit
+/// of processor time beyond it (50 µs to 500 µs): at most 2 ms later on an idle machine, 0.4 ms where limits are under 2 ms, and
+/// never because the machine held it up. A call that ends between its limit and that is good.
 pub struct Instance {
     // Dropped in this order: the place is given back only when the store is gone.
     live: Option<Live>,
@@ -154,7 +155,8 @@ impl Instance {
         let Some(live) = &mut self.live else {
             return Err(Fault::Trap("the instance could not be made".to_owned()));
         };
-        live.store.data_mut().set_deadline(deadline);
+        self.prepared.core.pace.call(limit_ns);
+        live.store.data_mut().set_deadline(deadline, limit_ns);
         live.store.set_epoch_deadline(1);
         let outcome = match run(live) {
             Ok(Ok(state)) => Ok(state),

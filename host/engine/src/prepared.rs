@@ -21,7 +21,7 @@ use crate::{
     convert,
     error::brief,
     sandbox::{CALL_BYTES_MAX, Call, PortFace, Sandbox, Stop, faces},
-    ticker::Ticker,
+    ticker::{Pace, Ticker},
 };
 
 /// What every component and instance of an engine shares. Declared so that the clock outlives all stores.
@@ -34,6 +34,8 @@ pub(crate) struct Core {
     pub(crate) trials: Places,
     /// As many at once as there are spare slots.
     pub(crate) inspections: Turnstile,
+    /// How finely the limits of calls cut time.
+    pub(crate) pace: Pace,
     /// Never read: it ticks until the last user of the engine is gone.
     pub(crate) _ticker: Ticker,
 }

@@ -69,6 +69,8 @@ pub(crate) struct Sandbox {
     refused: Option<Refused>,
     /// When the call must be over.
     deadline: Instant,
+    /// Processor time of its own that the call may still use after that, in ns.
+    own_time_ns: u64,
     /// The thread's own processor time when the deadline was first seen to have passed, in ns.
     late_from_ns: Option<u64>,
     pub(crate) call: Call,
@@ -85,9 +87,9 @@ pub(crate) struct Sandbox {
     pub(crate) lines_dropped: u64,
 }
 
-/// Processor time that a guest may still use after its deadline, in ns: half a tick, so that on an idle machine it is
-/// stopped at the second tick after the deadline.
-const OWN_TIME_NS: u64 = 500_000;
+/// Processor time that a guest may still use after its deadline, in ns, least and most: a quarter of its limit, and no more
+/// than half a coarse tick, so that on an idle machine it is stopped at the second tick after the deadline.
+const OWN_TIME_NS: (u64, u64) = (50_000, 500_000);
 
 /// Processor time of this thread, in ns.
 pub(crate) fn thread_time_ns() -> u64 {
@@ -126,6 +128,7 @@ impl Sandbox {
             memory_bytes: 0,
             refused: None,
             deadline,
+            own_time_ns: OWN_TIME_NS.1,
             late_from_ns: None,
             call: Call::Describe,
             ports,
@@ -146,14 +149,15 @@ impl Sandbox {
         self.memory_bytes
     }
 
-    /// When the next call must be over.
-    pub(crate) fn set_deadline(&mut self, deadline: Instant) {
+    /// When the next call must be over, and its limit in ns.
+    pub(crate) fn set_deadline(&mut self, deadline: Instant, limit_ns: u64) {
         self.deadline = deadline;
+        self.own_time_ns = (limit_ns / 4).clamp(OWN_TIME_NS.0, OWN_TIME_NS.1);
         self.late_from_ns = None;
     }
 
     /// At a tick: shall the guest be stopped? Its deadline must have passed, and it must then have used
-    /// [`OWN_TIME_NS`] of processor time: a guest that was held up by other work of the machine, and is about to end, is
+    /// its share of [`OWN_TIME_NS`] of processor time: a guest that was held up by other work of the machine, and is about to end, is
     /// late but not at fault. Costs nothing before the deadline, where all honest steps end.
     pub(crate) fn is_overdue(&mut self) -> bool {
         if Instant::now() < self.deadline {
@@ -161,7 +165,7 @@ impl Sandbox {
         }
         let used_ns = thread_time_ns();
         let from_ns = *self.late_from_ns.get_or_insert(used_ns);
-        used_ns.saturating_sub(from_ns) >= OWN_TIME_NS
+        used_ns.saturating_sub(from_ns) >= self.own_time_ns
     }
 
     /// Before any call but a step: nothing to see.

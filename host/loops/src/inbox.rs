@@ -18,6 +18,10 @@ use std::{
 
 use parking_lot::{Condvar, Mutex};
 
+/// Waiting events that are looked at: a host that was held up for seconds has thousands, and looking through all of them for
+/// each would hold it up again.
+const LOOKED_AT_MAX: usize = 256;
+
 /// What readers and writers share.
 struct Shared<T> {
     /// None when the reader is gone: then nothing may wait here, for somebody may wait for its end.
@@ -104,6 +108,14 @@ impl<T> Receiver<T> {
         self.0.queue.lock().as_mut().and_then(VecDeque::pop_front)
     }
 
+    /// Does one of the events that came last, and still wait, answer to this? Only the last [`LOOKED_AT_MAX`] are asked.
+    pub(crate) fn holds(&self, is: impl Fn(&T) -> bool) -> bool {
+        let queue = self.0.queue.lock();
+        queue
+            .as_ref()
+            .is_some_and(|queue| queue.iter().rev().take(LOOKED_AT_MAX).any(is))
+    }
+
     /// The next event, waiting for it at most `longest`.
     ///
     /// # Errors
@@ -149,6 +161,7 @@ mod tests {
         let all: Vec<_> = (0..4).map(|_| receiver.recv_timeout(Duration::ZERO)).collect();
         assert_eq!(all, [Ok(0), Ok(1), Ok(2), Err(Nothing::Timeout)]);
         sender.try_send(4).unwrap();
+        assert!(receiver.holds(|event| *event == 4) && !receiver.holds(|event| *event == 3));
         drop(receiver);
         assert_eq!(sender.try_send(5), Err(Full), "nobody reads any more");
     }

@@ -196,8 +196,16 @@ impl Worker {
         None
     }
 
-    /// A change of revision: both components step on the same frame here, and the bump decides.
-    pub(crate) fn revise(&mut self, id: &LoopId, mut running: Running, command: CommandId, revision: u64) {
+    /// A change of revision: both components step on the same frame here, and the bump decides. `fault` is the old one's,
+    /// where it need not be tried.
+    pub(crate) fn revise(
+        &mut self,
+        id: &LoopId,
+        mut running: Running,
+        command: CommandId,
+        revision: u64,
+        fault: Option<Fault>,
+    ) {
         let Some(seat) = self.seats.get_mut(id) else { return };
         let Some(old_index) = seat
             .held
@@ -210,7 +218,10 @@ impl Worker {
         // The old component first: whatever the new one does, this cycle has an answer.
         let old = &mut seat.held[old_index];
         let limit_ns = old.spec.step_limit_ns();
-        let old_step = old.instance.step(&running.frame, &running.state, limit_ns);
+        let old_step = match fault {
+            Some(fault) => Err(fault),
+            None => old.instance.step(&running.frame, &running.state, limit_ns),
+        };
         let attempt = match seat.held.iter().position(|h| h.spec.revision == revision) {
             Some(new_index) if new_index != old_index => {
                 try_revision(seat, old_index, new_index, &running, old_step.as_ref().ok())

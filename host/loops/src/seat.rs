@@ -65,6 +65,8 @@ pub(crate) struct Seat {
     /// Our own commit that no record has confirmed yet.
     inflight: Option<Arc<Record>>,
     running: Option<Running>,
+    /// A step here or for us that ran past its limit: revision, the record that it went on from, and the fault.
+    overran: Option<(u64, (u64, u64), Fault)>,
     recent: VecDeque<Asked>,
     owned: bool,
 }
@@ -227,6 +229,12 @@ impl Worker {
             Some(record) => Ok(Arc::clone(&record.state)),
             None => take_over(held, None, &actuators, limit_ns).map(|(state, _)| Arc::from(state)),
         };
+        // The same cycle in all but its number: last time its end came too late for its commit, and no record says so yet.
+        let again = seat
+            .overran
+            .as_ref()
+            .filter(|(revision, after, _)| (*revision, *after) == (sample.revision, sample.last))
+            .map(|(.., fault)| fault.clone());
         let fault = match (&state, bad_input) {
             (_, Some(port)) => {
                 events.push(CycleEvent::BadInput(port));
@@ -239,7 +247,12 @@ impl Worker {
                 });
                 Some(fault.clone())
             }
-            (Ok(_), None) => None,
+            (Ok(_), None) => again.inspect(|fault| {
+                events.push(CycleEvent::Faulted {
+                    replica: self.shared.here.clone(),
+                    fault: fault.to_string(),
+                });
+            }),
         };
         let left_ns = sample.left_ns;
         let here_at_ns = started_ns + (left_ns as f64 * HERE_PART) as u64;
@@ -280,12 +293,12 @@ impl Worker {
             next_at_ns: 0,
             give_up_at_ns: started_ns + left_ns / 10 * 9,
         };
-        if let Some(fault) = fault {
-            return self.conclude(&id, running, Err(fault));
-        }
-        match running.standing.revise {
-            Some((command, revision)) => self.revise(&id, running, command, revision),
-            None => self.advance(&id, running),
+        match (running.standing.revise, fault) {
+            // Another component would not see any better.
+            (_, Some(fault)) if bad_input.is_some() => self.conclude(&id, running, Err(fault)),
+            (Some((command, revision)), fault) => self.revise(&id, running, command, revision, fault),
+            (None, Some(fault)) => self.without_a_step(&id, running, fault),
+            (None, None) => self.advance(&id, running),
         }
     }
 
@@ -332,6 +345,7 @@ impl Worker {
                         }
                         Err(fault) => {
                             let replica = self.shared.here.clone();
+                            self.remember_overrun(id, &running, &fault);
                             running.events.push(CycleEvent::Faulted {
                                 replica,
                                 fault: fault.to_string(),
@@ -352,6 +366,14 @@ impl Worker {
                     return self.wait(id, running, until_ns);
                 }
             }
+        }
+    }
+
+    /// A step that runs past its limit may end too late for its cycle; then the next one must not try it again, or nobody
+    /// would ever hear of it: no record, no policy, no way back.
+    fn remember_overrun(&mut self, id: &LoopId, running: &Running, fault: &Fault) {
+        if let (Fault::Overrun { .. }, Some(seat)) = (fault, self.seats.get_mut(id)) {
+            seat.overran = Some((running.sample.revision, running.sample.last, fault.clone()));
         }
     }
 
@@ -432,6 +454,7 @@ impl Worker {
             Err(fault) => {
                 // A host that is not ready is no worse for it, only of no use now; a fault is the component's.
                 self.shared.replicas.answered(&asked.host, latency_ns);
+                self.remember_overrun(&id, &running, &fault);
                 running.events.push(CycleEvent::Faulted {
                     replica: asked.host,
                     fault: fault.to_string(),

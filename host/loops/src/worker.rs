@@ -10,10 +10,13 @@ use std::{
     time::Duration,
 };
 
-use bumpless_core::LoopId;
+use bumpless_core::{
+    LoopId,
+    protocol::{Sample, StepRequest},
+};
 
 use crate::{
-    calls::Calls,
+    calls::{Calls, is_call},
     event::Event,
     home::Home,
     inbox::{Nothing, Receiver},
@@ -145,9 +148,11 @@ impl Worker {
 
     fn handle(&mut self, event: Event) {
         match event {
+            Event::Sample(sample) if self.is_stale(&sample) => {}
             Event::Sample(sample) => self.sample(sample),
             Event::Answer(answer) => self.answer(*answer),
             Event::Record(record) => self.remote_record(&record),
+            Event::StepRequest(request) if self.is_overtaken(&request) => {}
             Event::StepRequest(request) => self.step_request(*request),
             Event::StepAnswer(answer) => self.step_answer(*answer),
             Event::Ping { from, token } => self.shared.wire.pong(&from, token),
@@ -169,6 +174,29 @@ impl Worker {
             Event::Call(call) => self.call(*call),
             Event::Stop => {}
         }
+    }
+
+    /// A newer cycle of the loop waits behind this one: its time is over, and work on it would only make the next one late. So
+    /// a host that was held up goes on with the present instead of working off its past.
+    fn is_stale(&self, sample: &Sample) -> bool {
+        let position = (sample.term, sample.seq);
+        self.inbox.holds(|event| match event {
+            Event::Sample(newer) => newer.loop_id == sample.loop_id && (newer.term, newer.seq) > position,
+            _ => false,
+        })
+    }
+
+    /// The same for a step: its owner has asked for a later cycle since. Calls have no cycles, so none overtakes another.
+    fn is_overtaken(&self, request: &StepRequest) -> bool {
+        !is_call(&request.loop_id)
+            && self.inbox.holds(|event| match event {
+                Event::StepRequest(newer) => {
+                    newer.loop_id == request.loop_id
+                        && newer.from == request.from
+                        && newer.frame.cycle.seq > request.frame.cycle.seq
+                }
+                _ => false,
+            })
     }
 
     /// A host is gone: homes look for another owner at once, seats and calls for another replica.
