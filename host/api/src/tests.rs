@@ -219,7 +219,6 @@ async fn what_cannot_be_read_is_a_problem_that_says_why() {
             "invalid",
             "control characters",
         ),
-        (get("/v1/bundle"), 400, "bad-request", "components"),
         (get("/v1/bundle?components=,"), 422, "invalid", "no component is named"),
         (
             raw("POST", "/v1/bundle", "application/wasm", "x"),

@@ -24,8 +24,9 @@ use crate::{
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct ExportQuery {
-    /// References, separated by commas: `name`, `name@version`, or a digest or its first 8 digits.
-    components: String,
+    /// References, separated by commas: `name`, `name@version`, or a digest or its first 8 digits. The whole library where
+    /// it is left out.
+    components: Option<String>,
 }
 
 /// A bundle takes the places of all uploads: it is in memory whole.
@@ -49,12 +50,16 @@ fn room(app: &App) -> Result<impl Drop + use<>, Problem> {
         (status = 200, description = "The bundle", body = Vec<u8>, content_type = "application/x-tar"),
         (status = "default", description = "What went wrong", body = Problem, content_type = "application/problem+json")))]
 pub(crate) async fn export(State(app): State<App>, InQuery(query): InQuery<ExportQuery>) -> Result<Response, Problem> {
-    let references: Vec<String> = query
-        .components
-        .split(',')
-        .map(|name| name.trim().to_owned())
-        .filter(|name| !name.is_empty())
-        .collect();
+    let references: Vec<String> = match query.components {
+        Some(names) => {
+            let names = names.split(',').map(|name| name.trim().to_owned());
+            names.filter(|name| !name.is_empty()).collect()
+        }
+        None => {
+            let all = app.cell.components().into_iter();
+            all.map(|view| view.info.digest.to_string()).collect()
+        }
+    };
     if references.is_empty() {
         return Err(Problem::new(
             Kind::Invalid,

@@ -88,6 +88,9 @@ async fn bundles_go_out_and_come_in() {
     assert_eq!(response.headers()[header::CONTENT_TYPE], "application/x-tar");
     let body = axum::body::to_bytes(response.into_body(), usize::MAX).await.unwrap();
     assert_eq!(body, "pid+on-off@1.0.0");
+    let whole = bench.ask(get("/v1/bundle")).await;
+    let body = axum::body::to_bytes(whole.into_body(), usize::MAX).await.unwrap();
+    assert_eq!(body.len(), 64, "the library by digest: one component");
     let (status, answer) = bench
         .json(raw("POST", "/v1/bundle?force=true&by=ann", "application/x-tar", "tar"))
         .await;

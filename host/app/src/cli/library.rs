@@ -89,8 +89,7 @@ pub(crate) enum ComponentsCommand {
     },
     /// Export some into one file, for a cell without a network: an OCI image layout in a tar.
     Export {
-        /// `name`, `name@version`, or a digest or its first 8 digits.
-        #[arg(required = true)]
+        /// `name`, `name@version`, or a digest or its first 8 digits; the whole library where none is named.
         components: Vec<String>,
         /// Where to.
         #[arg(long, short, value_name = "FILE")]

@@ -75,10 +75,12 @@ pub(crate) fn labels_line(labels: &BTreeMap<String, String>) -> String {
 /// Writes components into a file.
 pub(crate) fn export(client: &Client, components: &[String], output: &Path) -> Result<(), Error> {
     let names: Vec<String> = components.iter().map(|name| encoded(name)).collect();
-    let bytes = client.bytes(
-        &format!("/v1/bundle?components={}", names.join(",")),
-        BUNDLE_BYTES_MAX as u64 + 1,
-    )?;
+    let path = if names.is_empty() {
+        "/v1/bundle".to_owned()
+    } else {
+        format!("/v1/bundle?components={}", names.join(","))
+    };
+    let bytes = client.bytes(&path, BUNDLE_BYTES_MAX as u64 + 1)?;
     fs::write(output, &bytes).map_err(|source| Error::File {
         path: output.to_owned(),
         action: "written",
