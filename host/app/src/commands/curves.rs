@@ -9,7 +9,7 @@ use bumpless_api::types::{CurvePoint, Trial};
 use plotters::{prelude::*, style::Color as _};
 use ratatui::{
     buffer::Buffer,
-    layout::Rect,
+    layout::{Constraint, Rect},
     style::{Color, Style},
     symbols::Marker,
     widgets::{Axis, Block, Chart, Dataset, GraphType, Widget as _},
@@ -154,6 +154,8 @@ fn picture(panel: &Panel, columns: u16) -> Buffer {
     let (times, values) = (panel.times(), panel.values());
     let [low, high] = values;
     let chart = Chart::new(panel.lines.iter().map(dataset).collect())
+        // Half of the chart may be legend: it is small, and without it the colours say nothing.
+        .hidden_legend_constraints((Constraint::Ratio(1, 2), Constraint::Ratio(1, 2)))
         .block(Block::bordered().title(format!(" {} ", panel.title)))
         .x_axis(
             Axis::default()
@@ -323,7 +325,16 @@ mod tests {
                 (0..LINES).map(|y| row(&picture, y) + "\n").collect::<Vec<_>>()
             })
             .collect();
-        for part in ["pv, bar", "out, V", "\u{1b}[32m", "\u{1b}[33m", "\u{1b}[36m", "4.9 s"] {
+        for part in [
+            "pv, bar",
+            "out, V",
+            "setpoint",
+            "candidate",
+            "\u{1b}[32m",
+            "\u{1b}[33m",
+            "\u{1b}[36m",
+            "4.9 s",
+        ] {
             assert!(text.contains(part), "{part:?} is not in\n{text}");
         }
     }

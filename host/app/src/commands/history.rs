@@ -332,7 +332,14 @@ fn report(trial: &Trial) -> Result<(), Error> {
     let unit = &trial.measured_unit;
     show::line(&format!(
         "  the loop meanwhile: IAE {}, ISE {}, ITAE {}, Id {} %",
-        show::with_unit(trial.indices.iae, &format!("{unit}·s")),
+        show::with_unit(
+            trial.indices.iae,
+            &if unit.is_empty() {
+                String::new()
+            } else {
+                format!("{unit}·s")
+            }
+        ),
         show::maybe(trial.indices.ise),
         show::maybe(trial.indices.itae),
         show::maybe(trial.indices.id_percent)
