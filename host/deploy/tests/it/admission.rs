@@ -51,7 +51,10 @@ async fn what_fails_its_trial_stays_outside_and_force_is_remembered() {
         ("fails-start", "this guest never starts"),
         ("start-spins", "does not start with its default parameters"),
         ("jumps", "the component trapped"),
-        ("migrate-traps", "when it was to take over a state of its own: the component trapped"),
+        (
+            "migrate-traps",
+            "when it was to take over a state of its own: the component trapped",
+        ),
     ];
     for (guest, part) in table {
         let bytes = component(&format!("guests/{guest}"));
