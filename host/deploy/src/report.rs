@@ -1,6 +1,6 @@
 //! What a replay, a backtest or a shadow found: plain data, copied out.
 //!
-//! Never: decides anything; [`crate::rehearsal`] fills it in.
+//! Never: decides anything; replays and rehearsals fill it in.
 
 use std::collections::BTreeMap;
 

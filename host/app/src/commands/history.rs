@@ -58,7 +58,7 @@ pub(crate) fn run(client: &Client, json: bool, what: HistoryCommand) -> Result<(
                 to_unix_us: None,
             };
             let answer = client.post(&path(&name, "/backtest"), &request)?;
-            tried(json, &answer, answer.decode()?, candidate.plot.as_deref())
+            tried(json, &answer, &answer.decode()?, candidate.plot.as_deref())
         }
         HistoryCommand::Shadow {
             name,
@@ -265,20 +265,20 @@ fn shadow(json: bool, answer: &Answer, plot: Option<&Path>) -> Result<(), Error>
             found.id, found.report.cycles, found.cycles_wanted, found.missed
         ))?;
     }
-    tried(json, answer, found.report, plot)
+    tried(json, answer, &found.report, plot)
 }
 
 /// Prints what a candidate did, draws it where the output is a terminal, and writes it to a file where that was asked for.
-fn tried(json: bool, answer: &Answer, trial: Trial, plot: Option<&Path>) -> Result<(), Error> {
+fn tried(json: bool, answer: &Answer, trial: &Trial, plot: Option<&Path>) -> Result<(), Error> {
     if let Some(file) = plot {
-        curves::write_svg(&trial, file)?;
+        curves::write_svg(trial, file)?;
     }
     if json {
         return show::json(&answer.text);
     }
-    report(&trial)?;
+    report(trial)?;
     if std::io::stdout().is_terminal() {
-        curves::draw(&trial)?;
+        curves::draw(trial)?;
     }
     match plot {
         Some(file) => show::line(&format!("the curves are in {}", file.display())),
