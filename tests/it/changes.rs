@@ -18,7 +18,7 @@ fn running(count: usize, period_ms: f64) -> (Cell, Api, Feed) {
     api.upload_stock(&["pid", "pidplus", "cascade"]).unwrap();
     api.apply(&first_order_loop(0, "pid", period_ms)).unwrap();
     let feed = api.live(&format!("?loops={LOOP}")).unwrap();
-    feed.record_where("the loop at rest", |r| settled(r)).unwrap();
+    feed.record_where("the loop at rest", settled).unwrap();
     (cell, api, feed)
 }
 

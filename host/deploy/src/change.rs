@@ -8,6 +8,8 @@
 //! ```
 //! A change runs in a task of its own, so that an asker that goes away leaves nothing half done.
 
+mod readiness;
+
 use std::{sync::Arc, time::Duration};
 
 use bumpless_core::{Command, CommandBody, ComponentInfo, Event, HostId, Intent, LoopId, LoopSpec, Outcome, Record};
@@ -18,8 +20,9 @@ use tokio::{sync::oneshot, time::timeout};
 use crate::{
     admission::step_warnings,
     bench::stopping,
+    change::readiness::Readiness,
     draft::LoopDraft,
-    error::{Error, Words, chain},
+    error::{Error, chain},
     holder::wanted_members,
     limits::{CHANGE_WAIT, COMMAND_WAIT_MIN, LOOPS_MAX, READY_WAIT},
     plan::{self, Ground},
@@ -50,38 +53,6 @@ impl Dropped {
             notes,
         };
         (spec, dropped)
-    }
-}
-
-/// How the members answered.
-struct Readiness {
-    ready: Vec<HostId>,
-    missing: Vec<(HostId, Error)>,
-}
-
-impl Readiness {
-    fn reasons(&self) -> String {
-        self.missing
-            .iter()
-            .map(|(host, error)| format!("{host}: {}", error.words()))
-            .collect::<Vec<_>>()
-            .join("; ")
-    }
-
-    /// The error where nobody can run it: what the component or the parameters did wrong is wrong everywhere, so its kind
-    /// counts before a host that is away.
-    fn failure(&self, what: &str, cure: &str) -> Error {
-        let words = Words::new(format!("{what} ({})", self.reasons()), cure);
-        let kinds = || self.missing.iter().map(|(_, error)| error);
-        if kinds().any(|e| matches!(e, Error::Invalid(_) | Error::Refused(_) | Error::NotFound(_))) {
-            Error::Refused(words)
-        } else if kinds().any(|e| matches!(e, Error::Busy(_))) {
-            Error::Busy(words)
-        } else if kinds().any(|e| matches!(e, Error::Timeout(_))) {
-            Error::Timeout(words)
-        } else {
-            Error::Unreachable(words)
-        }
     }
 }
 
