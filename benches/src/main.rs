@@ -24,6 +24,7 @@ mod step;
 mod stress;
 mod swap;
 mod switch;
+mod upload;
 
 use std::process::ExitCode;
 
@@ -57,6 +58,8 @@ enum Bench {
     /// With --hz, --count or --kill: hundreds on one fast loop, also while its owner is killed, then components that go wrong
     /// on probation.
     Swap(switch::Switching),
+    /// From an upload to the first cycle, what running loops feel of it, bombs, and many uploads at once.
+    Upload,
     /// A step native and in the sandbox, and the cycle of a loop whose owner, replica and I/O are one process.
     Step,
     /// The other process of `call`.
@@ -122,6 +125,7 @@ fn run(bench: &Bench, options: Options) -> Result<bool, Error> {
         Bench::Select => "select",
         Bench::Swap(_) => "swap",
         Bench::Step => "step",
+        Bench::Upload => "upload",
         Bench::Burn { core } => return stress::burn(*core).map(|()| true),
         Bench::CallPeer { component } => return peer::run(component).map(|()| true),
     };
@@ -134,6 +138,7 @@ fn run(bench: &Bench, options: Options) -> Result<bool, Error> {
         Bench::Swap(switching) if switching.is_wanted() => switch::run(options, *switching, &mut report)?,
         Bench::Swap(_) => swap::run(options, &mut report)?,
         Bench::Step => step::run(options, &mut report)?,
+        Bench::Upload => upload::run(options, &mut report)?,
         Bench::CallPeer { .. } | Bench::Burn { .. } => {}
     }
     Ok(report.end())

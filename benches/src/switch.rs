@@ -7,7 +7,8 @@
 //! kills:   owner ─ kill -9 at a random moment of a swap ─► another owner ─► restarted ─► stepping ─► …
 //! probation: traps, spins, returns NaN, jumps, each after a few good cycles ─► rolled back in that same cycle
 //! ```
-//! Up to 200 Hz the replicas share the steps; faster loops are stepped by their owner, as one would run them.
+//! Up to 200 Hz the replicas share the steps. A faster loop is owned by the host that serves its points, as one would run it: on
+//! a machine where a message between two processes takes half a millisecond, no other host could answer within one.
 
 use std::{
     collections::BTreeMap,
@@ -61,7 +62,7 @@ const SETTLE: Duration = Duration::from_secs(30);
 /// What is switched how. Without any of these `swap` runs its own plan.
 #[derive(Debug, Clone, Copy, Args)]
 pub(crate) struct Switching {
-    /// One loop at this rate, in Hz, swapped as fast as the swaps come into force; 1 to 1000, usually 1000.
+    /// One loop at this rate, in Hz, swapped as fast as the swaps come into force; 1 to 1000, usually 1000, and 100 with kills.
     #[arg(long, value_parser = rate)]
     hz: Option<f64>,
     /// So many swaps of that loop, usually 500.
@@ -87,7 +88,12 @@ impl Switching {
     }
 
     fn hz(&self) -> f64 {
-        self.hz.unwrap_or(1000.0)
+        self.hz.unwrap_or(if self.kill { 100.0 } else { 1000.0 })
+    }
+
+    /// Do the replicas share the steps?
+    fn is_shared(&self) -> bool {
+        self.kill || self.hz() <= SHARED_HZ_MAX
     }
 
     fn period_ns(&self) -> u64 {
@@ -96,7 +102,7 @@ impl Switching {
 
     /// A loop file. A takeover before 80 % of a millisecond would meet an owner that only waited for its turn.
     fn draft(&self, component: &str, parameters: &BTreeMap<&str, f64>, deviation_percent: Option<f64>) -> Value {
-        let shared = self.hz() <= SHARED_HZ_MAX;
+        let shared = self.is_shared();
         json!({
             "name": LOOP,
             "component": component,
@@ -104,6 +110,7 @@ impl Switching {
             "ports": { "pv": "plant.0.pv", "out": POINT },
             "parameters": parameters,
             "setpoint": 40.0,
+            "replicas": 4,
             "strategy": if shared { "round-robin" } else { "local" },
             "policy": {
                 "takeover_part": if shared { 0.4 } else { 0.8 },
@@ -172,7 +179,11 @@ pub(crate) fn run(options: Options, switching: Switching, report: &mut Report) -
         }
     ));
     let fopdt = "{ count = 1, gain = 1.0, tau_s = 1.0, dead_time_s = 0.1, noise = 0.002 }";
-    let cell = Cell::start(CellOptions::first_order(fopdt))?;
+    let mut cell_options = CellOptions::first_order(fopdt);
+    if !switching.is_shared() {
+        "[roles]\nio = true\ncontrol = true\n".clone_into(&mut cell_options.plant_tables);
+    }
+    let cell = Cell::start(cell_options)?;
     let api = cell.plant.api();
     api.upload_stock(&["pid", "pidplus"])?;
     let pid = law::component_path("pid")?;
@@ -185,7 +196,11 @@ pub(crate) fn run(options: Options, switching: Switching, report: &mut Report) -
     let history = Arc::new(History::follow(&api, &[LOOP])?);
     let watch = Watch::start();
     let clock = Clock::start();
-    history.wait("the first cycles", 0, |record| record.seq > 100)?;
+    if !switching.is_shared() {
+        api.move_owner(LOOP, "plant")?;
+    }
+    let wanted = |record: &Seen| record.seq > 100 && (switching.is_shared() || record.owner == "plant");
+    history.wait("the first cycles", 0, wanted)?;
 
     let before = Tally::ask(&api, LOOP)?;
     let from_ns = clock.now_ns();

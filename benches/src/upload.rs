@@ -1,0 +1,310 @@
+//! `upload`: from the first byte of an upload to the first cycle of a running loop, and what the other loops feel of it.
+//!
+//! ```text
+//! quiet ─► uploads: fresh law, swapped in at once, again and again ─► quiet ─► uploads ─► …      (rounds take turns)
+//! then: 10 MB of code; a bomb that compiles for minutes; one that eats memory; 100 uploads at once
+//! ```
+//! Jitter is how far two writes of an actuator are from one period apart, without what the machine itself stalled; the ratio
+//! is that under uploads to that of the quiet rounds of the same run.
+
+use std::{
+    thread::JoinHandle,
+    time::{Duration, Instant},
+};
+
+use bumpless_io::Clock;
+use bumpless_tests::{Api, Cell, CellOptions, Journal};
+use serde_json::{Value, json};
+
+use crate::{
+    Options,
+    actuator::{self, Felt, felt},
+    error::Error,
+    history::History,
+    law,
+    report::{Bound, Report},
+    spread::Spread,
+    stall::{Stalls, Watch},
+    swap::fresh,
+};
+
+/// The loop that is changed.
+const CHANGED: &str = "changed";
+/// The loop that is watched; nobody touches it.
+const WATCHED: &str = "watched";
+/// Its actuator.
+const WATCHED_POINT: &str = "plant.1.out";
+/// Period of both, in ns.
+const PERIOD_NS: u64 = 10_000_000;
+/// Loops beside them, at 20 Hz.
+const OTHERS: usize = 20;
+/// A large component, in bytes: its code, many times over.
+const LARGE_BYTES: usize = 10 * 1024 * 1024;
+/// A component that compiles for longer than anybody waits; near the greatest size that is taken at all.
+const BOMB_BYTES: usize = 31 * 1024 * 1024;
+/// Uploads that come at once.
+const CROWD: u64 = 100;
+
+/// Times of a round, in ns since 1970.
+type Span = (u64, u64);
+
+/// Runs the bench.
+pub(crate) fn run(options: Options, report: &mut Report) -> Result<(), Error> {
+    let uploads = options.count(60, 8);
+    let rounds = options.count(4, 2);
+    report.progress("a plant and three controllers in four processes, two loops at 100 Hz and 20 at 20 Hz");
+    let fopdt = format!(
+        "{{ count = {}, gain = 1.0, tau_s = 1.0, dead_time_s = 0.1, noise = 0.002 }}",
+        OTHERS + 2
+    );
+    let cell = Cell::start(CellOptions::first_order(&fopdt))?;
+    let api = cell.plant.api();
+    api.upload_stock(&["pid"])?;
+    for (number, name) in [CHANGED, WATCHED].into_iter().enumerate() {
+        api.apply(&draft(name, number, 10.0))?;
+    }
+    for number in 2..OTHERS + 2 {
+        api.apply(&draft(&format!("other-{number}"), number, 50.0))?;
+    }
+    let history = History::follow(&api, &[CHANGED])?;
+    for host in ["a", "b", "c"] {
+        history.wait_steps(&[CHANGED], host, 0)?;
+    }
+    let path = law::component_path("pid")?;
+    let pid = std::fs::read(&path).map_err(Error::io(format!("{} cannot be read", path.display())))?;
+    let (watch, clock) = (Watch::start(), Clock::start());
+    let (mut quiet, mut busy, mut number) = (Vec::<Span>::new(), Vec::<Span>::new(), 0);
+    let mut to_running = Spread::new();
+    for round in 0..rounds {
+        report.progress(&format!(
+            "round {} of {rounds}: {} uploads, then as long without",
+            round + 1,
+            uploads / rounds
+        ));
+        let (from_ns, started) = (clock.now_ns(), Instant::now());
+        for _ in 0..uploads / rounds {
+            number += 1;
+            let Some(bytes) = fresh(&pid, number) else { continue };
+            to_running.add(upload_to_running(&api, &history, &bytes)?);
+        }
+        busy.push((from_ns, clock.now_ns()));
+        let from_ns = clock.now_ns();
+        std::thread::sleep(started.elapsed());
+        quiet.push((from_ns, clock.now_ns()));
+    }
+
+    report.progress("a component with 10 MB of code");
+    let from_ns = clock.now_ns();
+    let large = upload_to_running(&api, &history, &many_times(&pid, LARGE_BYTES, 900))?;
+    let large_span = (from_ns, clock.now_ns());
+    api.swap(CHANGED, "pid@0.1.0")?;
+
+    report.progress("bombs, and 100 uploads at once");
+    let from_ns = clock.now_ns();
+    let bombs = [
+        ("compile_bomb", answer(&api, &many_times(&pid, BOMB_BYTES, 901))),
+        ("memory_bomb", answer(&api, &guest("grows-memory")?)),
+        ("endless_start", answer(&api, &guest("start-spins")?)),
+    ];
+    let crowd = crowd(&api, &pid)?;
+    let bombs_span = (from_ns, clock.now_ns());
+    // The journal reaches the disk within a quarter of a second.
+    std::thread::sleep(Duration::from_millis(500));
+    let stalls = watch.finish();
+    let journal = cell.journal()?;
+
+    report.told("upload.uploads", to_running.count() as f64, "components");
+    for (part, text) in [(0.5, "p50"), (0.99, "p99")] {
+        report.told(&format!("upload.to_running.{text}"), to_running.us(part) / 1e3, "ms");
+    }
+    report.told("upload.to_running_10mb", large as f64 / 1e6, "ms");
+    let jitter = |spans: &[Span]| jitter(&journal, spans, &stalls);
+    let (without, with) = (jitter(&quiet), jitter(&busy));
+    for (part, text) in [(0.5, "p50"), (0.99, "p99"), (0.999, "p99_9")] {
+        report.told(&format!("upload.jitter_without.{text}"), without.us(part), "µs");
+        report.told(&format!("upload.jitter_with.{text}"), with.us(part), "µs");
+    }
+    let ratio = with.us(0.999) / without.us(0.999).max(1.0);
+    report.figure("upload.jitter_ratio.p99_9", ratio, "×", Bound::AtMost(1.1));
+    for (name, spans) in [
+        ("while_uploading", busy.as_slice()),
+        ("with_10mb", &[large_span]),
+        ("with_bombs", &[bombs_span]),
+    ] {
+        let mut all = Felt::default();
+        for span in spans {
+            all.join(&felt(&journal, WATCHED_POINT, PERIOD_NS, *span, &stalls));
+        }
+        all.tell(report, &format!("upload.{name}"), Bound::AtMost(0.0), Bound::None);
+    }
+    for (name, status) in &bombs {
+        let refused = status.as_ref().is_ok_and(|status| (400..500).contains(status));
+        report.figure(
+            &format!("upload.{name}.refused"),
+            f64::from(refused),
+            "",
+            Bound::AtLeast(1.0),
+        );
+    }
+    report.told("upload.crowd.taken", crowd.taken as f64, "components");
+    report.told("upload.crowd.told_to_wait", crowd.busy as f64, "answers");
+    report.figure(
+        "upload.crowd.other_answers",
+        crowd.other as f64,
+        "answers",
+        Bound::AtMost(0.0),
+    );
+    report.figure(
+        "upload.crowd.half_taken",
+        crowd.half_taken as f64,
+        "components",
+        Bound::AtMost(0.0),
+    );
+    actuator::tell_writers(report, "upload", &journal);
+    stalls.tell(report, "upload");
+    Ok(())
+}
+
+fn draft(name: &str, number: usize, period_ms: f64) -> Value {
+    json!({
+        "name": name,
+        "component": "pid",
+        "period_ms": period_ms,
+        "ports": { "pv": format!("plant.{number}.pv"), "out": format!("plant.{number}.out") },
+        "parameters": { "k": 1.5, "ti": 1.0 },
+        "setpoint": 40.0,
+        "strategy": "round-robin",
+    })
+}
+
+/// From the request to the first committed cycle that the component stepped, in ns.
+fn upload_to_running(api: &Api, history: &History, bytes: &[u8]) -> Result<u64, Error> {
+    let (place, started) = (history.place(), Instant::now());
+    let uploaded = api.upload_bytes(bytes)?;
+    let digest = uploaded["digest"].as_str().unwrap_or_default().to_owned();
+    api.swap(CHANGED, &digest)?;
+    history.wait("the first cycle of an uploaded component", place, |record| {
+        record.digest == digest
+    })?;
+    Ok(u64::try_from(started.elapsed().as_nanos()).unwrap_or(u64::MAX))
+}
+
+/// How far two writes of the watched actuator are from one period apart, in ns, without the machine's stalls.
+fn jitter(journal: &Journal, spans: &[Span], stalls: &Stalls) -> Spread {
+    let mut spread = Spread::new();
+    for gap in journal.gaps(WATCHED_POINT, 0) {
+        if spans
+            .iter()
+            .any(|(from_ns, to_ns)| (*from_ns..*to_ns).contains(&gap.to_ns))
+            && stalls.within_ns(gap.from_ns, gap.to_ns) == 0
+        {
+            spread.add(gap.ns().abs_diff(PERIOD_NS));
+        }
+    }
+    spread
+}
+
+/// The law with its own code behind it, again and again, as modules that nobody instantiates: all of it is compiled. Format:
+/// component-model binary, section 1 is a core module.
+fn many_times(pid: &[u8], bytes_min: usize, version: u64) -> Vec<u8> {
+    let mut bytes = fresh(pid, version).unwrap_or_else(|| pid.to_vec());
+    let Some(module) = first_module(pid).map(<[u8]>::to_vec) else {
+        return bytes;
+    };
+    while bytes.len() + module.len() + 6 < bytes_min {
+        bytes.push(1);
+        let mut left = module.len();
+        while left >= 0x80 {
+            bytes.push((left & 0x7f) as u8 | 0x80);
+            left >>= 7;
+        }
+        bytes.push(left as u8);
+        bytes.extend_from_slice(&module);
+    }
+    bytes
+}
+
+/// The payload of the first section 1 of a component.
+fn first_module(component: &[u8]) -> Option<&[u8]> {
+    let mut rest = component.get(8..)?;
+    while let Some((kind, after)) = rest.split_first() {
+        let (mut length, mut shift, mut at) = (0_usize, 0, 0);
+        loop {
+            let byte = *after.get(at)?;
+            at += 1;
+            length |= usize::from(byte & 0x7f) << shift;
+            shift += 7;
+            if byte & 0x80 == 0 {
+                break;
+            }
+        }
+        let payload = after.get(at..at + length)?;
+        if *kind == 1 {
+            return Some(payload);
+        }
+        rest = after.get(at + length..)?;
+    }
+    None
+}
+
+fn guest(name: &str) -> Result<Vec<u8>, Error> {
+    let path = law::component_path(&format!("guests/{name}"))?;
+    std::fs::read(&path).map_err(Error::io(format!("{} cannot be read", path.display())))
+}
+
+/// The status of an upload's answer.
+fn answer(api: &Api, bytes: &[u8]) -> Result<u16, Error> {
+    let answer = api.send("POST", "/v1/components", &[("content-type", "application/wasm")], bytes)?;
+    Ok(answer.status)
+}
+
+#[derive(Default)]
+struct Crowd {
+    taken: u64,
+    busy: u64,
+    other: u64,
+    half_taken: u64,
+}
+
+/// Many uploads of different components at once.
+fn crowd(api: &Api, pid: &[u8]) -> Result<Crowd, Error> {
+    let send = |number: u64| -> Result<JoinHandle<Option<u16>>, Error> {
+        let (api, bytes) = (api.clone(), fresh(pid, 500 + number).unwrap_or_default());
+        std::thread::Builder::new()
+            .name(format!("upload-{number}"))
+            .spawn(move || answer(&api, &bytes).ok())
+            .map_err(Error::io("an upload's thread cannot be started"))
+    };
+    let threads = (0..CROWD).map(send).collect::<Result<Vec<_>, _>>()?;
+    let mut crowd = Crowd::default();
+    for thread in threads {
+        match thread.join() {
+            Ok(Some(200 | 201)) => crowd.taken += 1,
+            Ok(Some(429 | 503)) => crowd.busy += 1,
+            _ => crowd.other += 1,
+        }
+    }
+    // Each is in the library or not: as many of the crowd's versions as were told to be taken.
+    let there = api.components()?;
+    let ours = there
+        .iter()
+        .filter(|c| c["version"].as_str().is_some_and(|version| version.starts_with('5')));
+    crowd.half_taken = (ours.count() as u64).abs_diff(crowd.taken);
+    Ok(crowd)
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "tests")]
+
+    use super::*;
+
+    #[test]
+    fn a_large_component_is_one_that_the_engine_takes() {
+        let pid = std::fs::read(bumpless_tests::components().unwrap().join("pid.wasm")).unwrap();
+        let large = many_times(&pid, 200 * 1024, 900);
+        assert!((150 * 1024..=200 * 1024).contains(&large.len()), "{}", large.len());
+        let engine = bumpless_engine::Engine::new(bumpless_engine::Config::default()).unwrap();
+        assert_eq!(engine.inspect(&large).unwrap().descriptor.name, "pid");
+    }
+}
