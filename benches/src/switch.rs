@@ -113,7 +113,7 @@ impl Switching {
             "replicas": 4,
             "strategy": if shared { "round-robin" } else { "local" },
             "policy": {
-                "takeover_part": if shared { 0.4 } else { 0.8 },
+                "takeover_part": if shared { 0.35 } else { 0.8 },
                 "probation_deviation_percent": deviation_percent,
             },
         })

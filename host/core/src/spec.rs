@@ -173,9 +173,9 @@ impl Default for Policy {
             on_bad_input: OnFault::Hold,
             step_limit_us: 0,
             // The owner must have tried a replica and itself before the arbiter looks elsewhere, so hedge < takeover.
-            // A takeover at 0.4 ends before half of the next period has gone, and leaves time for a second one.
-            hedge_part: 0.15,
-            takeover_part: 0.4,
+            // A takeover at 0.35 is over well before half of the period has gone, and leaves time for a second and a third.
+            hedge_part: 0.12,
+            takeover_part: 0.35,
             bump_limit_percent: 5.0,
             on_bump: OnBump::Refuse,
             probation_cycles: 20,

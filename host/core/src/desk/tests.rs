@@ -83,11 +83,11 @@ fn a_silent_owner_is_replaced_within_the_period_and_fenced() {
     desk.take(first.at_ns + 1, commit(&first));
     let second = next(&mut desk);
     assert_eq!(
-        desk.overdue(second.at_ns + 39),
+        desk.overdue(second.at_ns + 34),
         None,
-        "four tenths of the period are the owner's"
+        "a third of the period is the owner's"
     );
-    let again = sent(desk.overdue(second.at_ns + 40));
+    let again = sent(desk.overdue(second.at_ns + 35));
     assert_eq!(
         (again.owner.clone(), again.seq, again.at_ns),
         (host(1), second.seq, second.at_ns)
