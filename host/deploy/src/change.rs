@@ -8,6 +8,7 @@
 //! ```
 //! A change runs in a task of its own, so that an asker that goes away leaves nothing half done.
 
+mod amend;
 mod readiness;
 
 use std::{sync::Arc, time::Duration};
@@ -28,7 +29,7 @@ use crate::{
     plan::{self, Ground},
     room::{Room, count},
     view::{ApplyEnd, HandOverView},
-    wire::{Amend, Ask, Notice, Told},
+    wire::{Ask, Notice, Told},
 };
 
 /// What a swap leaves behind.
@@ -88,59 +89,6 @@ impl Room {
                     room.change(intent, spec, &info, Dropped::default()).await
                 }
             }
-        })
-        .await
-    }
-
-    /// Changes a loop by a part.
-    pub(crate) async fn amend_here(
-        self: &Arc<Self>,
-        from: HostId,
-        id: LoopId,
-        amend: Amend,
-    ) -> Result<ApplyEnd, Error> {
-        self.in_turn(id.clone(), move |room| async move {
-            let intent = room.book.find(&id)?;
-            room.is_home(&intent)?;
-            let current = &intent.current;
-            let (spec, dropped) = match amend {
-                Amend::Swap(reference) => {
-                    let info = room.component(&reference, &from).await?;
-                    let old = room.info_of(current.digest, Some(&from)).await.ok();
-                    let swapped = plan::swap(
-                        current,
-                        info.digest,
-                        old.as_ref().map(|i| &i.descriptor),
-                        &info.descriptor,
-                    );
-                    Dropped::of(swapped)
-                }
-                Amend::Set(change) => (plan::set(current, &change), Dropped::default()),
-                Amend::Rollback(revision) => {
-                    let earlier = match revision {
-                        Some(revision) => intent.find(revision),
-                        None => intent.previous(),
-                    };
-                    let spec = earlier.cloned().ok_or_else(|| {
-                        let known = intent
-                            .past
-                            .iter()
-                            .map(|s| s.revision.to_string())
-                            .collect::<Vec<_>>()
-                            .join(", ");
-                        let cure = if known.is_empty() {
-                            "it has none".to_owned()
-                        } else {
-                            format!("it has {known}")
-                        };
-                        Error::not_found(format!("loop {id} has no such revision to go back to"), cure)
-                    })?;
-                    (spec, Dropped::default())
-                }
-            };
-            let info = room.info_of(spec.digest, Some(&from)).await?;
-            let spec = plan::complete(spec, &info.descriptor, &room.ground(&|p| room.point_facts(p, &id)))?;
-            room.change(Arc::clone(&intent), spec, &info, dropped).await
         })
         .await
     }

@@ -29,6 +29,7 @@ use crate::{
 };
 
 mod past;
+mod rollouts;
 
 /// Pause between two looks whether a draining host still owns loops.
 const DRAIN_LOOK: Duration = Duration::from_millis(20);

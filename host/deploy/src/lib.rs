@@ -17,6 +17,7 @@
 //! Reading order: `draft`, `view`, `error` (what people see); `wire`, `field` (what this room speaks); `plan` (pure);
 //! `book`, `library`, `roster`, `feed` (what it keeps); `admission`, `bench`, `holder`, `home`, `change`, `orders` (what it does);
 //! `trials` with `rehearsal`, `verdict`, `replay`, `shadows`, `curve`, `report` (looking back, and trying candidates);
+//! `rollout` (one component for many loops, by rule);
 //! `sync`, `answers`, `service`, `room`, `deploy` (how it hangs together).
 
 mod admission;
@@ -51,6 +52,7 @@ mod wire;
 pub mod draft;
 pub mod limits;
 pub mod report;
+pub mod rollout;
 pub mod view;
 
 pub use bumpless_store::Window;

@@ -161,6 +161,40 @@ pub const RECORDS_TOLD_BYTES_MAX: usize = 8 * 1024 * 1024;
 /// Cycles of one shadow: a day of a loop at 10 Hz.
 pub const SHADOW_CYCLES_MAX: u64 = 1_000_000;
 
+/// Loops of one rollout: its report fits on a page, and its row on the disk.
+pub const ROLLOUT_LOOPS_MAX: usize = 256;
+
+/// Cycles that a rollout watches each loop for: a quarter of an hour at 10 Hz.
+pub const ROLLOUT_CYCLES_MAX: u32 = 10_000;
+
+/// Greatest factor between the errors after and before a change: more is as good as no bound.
+pub const ROLLOUT_FACTOR_MAX: f64 = 1_000.0;
+
+/// Part of the setpoint's range below which an error is none: what a good instrument is accurate to.
+pub const ROLLOUT_ERROR_PART: f64 = 0.001;
+
+/// Loops of one rollout under change or watch at a time: as many changes as a home works on at once.
+pub const ROLLOUT_AT_ONCE_MAX: u32 = 16;
+
+/// Rollouts under way at one host: each looks at every record that passes.
+pub const ROLLOUTS_RUNNING_MAX: usize = 4;
+
+/// Rollouts that a host keeps to be looked at: some 200 KB each at most.
+pub const ROLLOUTS_KEPT_MAX: usize = 16;
+
+/// How long a rollout goes on asking a home that is away or busy, before that is a failure.
+pub const ROLLOUT_ASK_FOR: Duration = Duration::from_secs(60);
+
+/// Pause between two such questions.
+pub const ROLLOUT_ASK_PAUSE: Duration = Duration::from_secs(1);
+
+/// How often a rollout looks at its own waits. Records wake it besides.
+pub const ROLLOUT_LOOK_EVERY: Duration = Duration::from_millis(200);
+
+/// A loop may take this much longer to be seen than its cycles take at its period, and four times as long besides: cycles
+/// may be lost, and hosts may go.
+pub const ROLLOUT_WATCH_SLACK: Duration = Duration::from_secs(30);
+
 /// Longest time of a first call on a new instance, in ns: its memory is touched for the first time.
 pub const WARM_LIMIT_NS: u64 = 100_000_000;
 

@@ -42,6 +42,7 @@ use crate::{
     limits::{
         CHANGES_MAX, NOTICES_WAITING_MAX, RECONCILE_EVERY, REHEARSALS_MAX, SENDING_MAX, UPLOADS_MAX, VITALS_EVERY,
     },
+    rollout::ledger::Ledger,
     roster::Roster,
     shadows::Shadows,
     view::Counters,
@@ -143,6 +144,7 @@ pub(crate) struct Room {
     pub(crate) feed: Feed,
     pub(crate) cycles: Option<Arc<CycleLog>>,
     pub(crate) shadows: Shadows,
+    pub(crate) rollouts: Ledger,
     /// Replays and backtests.
     pub(crate) rehearsals: Semaphore,
     pub(crate) holder: Holder,
@@ -213,6 +215,7 @@ impl Room {
             feed: Feed::new(writer),
             cycles,
             shadows: Shadows::default(),
+            rollouts: Ledger::default(),
             rehearsals: Semaphore::new(REHEARSALS_MAX),
             holder: Holder::default(),
             homes: Homes::default(),
@@ -250,6 +253,7 @@ impl Room {
         room.spawn(Self::reconcile_holds(Arc::clone(&room)));
         room.spawn(Self::prepare_ahead(Arc::clone(&room)));
         room.spawn(Self::hear_notices(Arc::clone(&room), arrived));
+        room.resume_rollouts()?;
         Ok(room)
     }
 

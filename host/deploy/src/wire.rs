@@ -4,6 +4,8 @@
 //! component's bytes follow their own first bytes as they are, because they are large.
 //! Never: trusts what it reads; every value that matters is checked where it is used.
 
+use std::collections::BTreeMap;
+
 use bumpless_core::{Command, ComponentInfo, Digest, Edition, HostId, Intent, LoopId, LoopSpec, PointId, Record};
 use bumpless_store::{Tombstone, Window};
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
@@ -12,6 +14,7 @@ use crate::{
     draft::{Change, LoopDraft},
     error::{Error, Words},
     report::{CyclesView, ReplayReport, ShadowView, Trial, TrialReport},
+    rollout::RolloutView,
     view::{ApplyEnd, CommandEnd, PointView, Stage},
 };
 
@@ -74,6 +77,19 @@ pub(crate) enum Ask {
     Backtest(LoopId, Box<Trial>, Window),
     /// To the home: a candidate on the cycles to come.
     Shadow(LoopId, ShadowAsk),
+    /// About the rollouts of the host.
+    Rollout(RolloutAsk),
+}
+
+/// What may be asked about rollouts.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) enum RolloutAsk {
+    /// All of the host, without their loops.
+    List,
+    /// One.
+    Show(u64),
+    /// Stop one.
+    Stop(u64),
 }
 
 /// A change of a loop by a part.
@@ -85,6 +101,28 @@ pub(crate) enum Amend {
     Set(Change),
     /// An earlier revision; the one before where none is named.
     Rollback(Option<u64>),
+    /// A rollout brings a component.
+    Roll(Roll),
+    /// A rollout takes its component back: revision `to`, where `from` is still in force.
+    Return {
+        /// What the rollout brought.
+        from: u64,
+        /// What ran before.
+        to: u64,
+    },
+}
+
+/// A rollout's change of one loop, for as long as nobody else changed it. Asked again, it is done once.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Roll {
+    /// The component, by digest.
+    pub(crate) component: String,
+    /// Parameters that differ from those that a swap takes over.
+    pub(crate) parameters: BTreeMap<String, f64>,
+    /// The revision in force when the rollout began.
+    pub(crate) before: u64,
+    /// The greatest revision number that was given by then.
+    pub(crate) last_before: u64,
 }
 
 /// What may be asked about shadows.
@@ -135,6 +173,8 @@ pub(crate) enum Told {
     Tried(Box<TrialReport>),
     /// Shadows.
     Shadows(Vec<ShadowView>),
+    /// Rollouts.
+    Rollouts(Vec<RolloutView>),
     /// A component's bytes. Never written by serde: see [`encode_reply`].
     #[serde(skip)]
     Bytes(Vec<u8>),
@@ -220,8 +260,6 @@ pub(crate) fn decode_reply(mut bytes: Vec<u8>) -> Result<Told, Error> {
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used, clippy::expect_used, reason = "tests")]
-
-    use std::collections::BTreeMap;
 
     use bumpless_core::{Mode, OutputLimit, Policy, Strategy};
 

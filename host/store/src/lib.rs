@@ -7,7 +7,7 @@
 //! ```text
 //! <dir>/                     0700
 //!   lock                     held while a process has the store open; names that process
-//!   host.redb                infos, intents, tombstones, last records, settings
+//!   host.redb                infos, intents, tombstones, last records, rollouts, settings
 //!   cycles.redb              every record of the loops at home here, up to a bound
 //!   components/<digest>.wasm the bytes, named by what they are
 //!   secrets/<name>           0600, 32 random bytes
@@ -15,7 +15,7 @@
 //!
 //! | what | durable when the call returns? | why |
 //! |---|---|---|
-//! | component, info, intent, tombstone, setting, secret | yes, fsync | people were told that it is done |
+//! | component, info, intent, tombstone, rollout, setting, secret | yes, fsync | people were told that it is done |
 //! | recorded cycle | no: within a second | it is for looking back; nothing that runs depends on it |
 //! | last record | no: within a second | the standbys hold newer ones; a sync per cycle would wear out the disk |
 //!
@@ -29,6 +29,7 @@ mod error;
 mod format;
 mod intents;
 mod records;
+mod rollouts;
 mod settings;
 mod store;
 mod writer;

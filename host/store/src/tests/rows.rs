@@ -299,3 +299,25 @@ proptest! {
         prop_assert_eq!(encode(name, &back).unwrap(), row);
     }
 }
+
+#[test]
+fn rollouts_are_kept_by_number_and_forgotten_one_by_one() {
+    let dir = tempdir().unwrap();
+    {
+        let store = Store::open(dir.path()).unwrap();
+        assert_eq!(store.rollouts::<String>().unwrap(), []);
+        for (number, text) in [(10, "ten"), (2, "two"), (10, "ten again")] {
+            store.put_rollout(number, &text).unwrap();
+        }
+        store.put_rollout(3, &7_u8).unwrap();
+        let error = store.put_rollout(4, &vec![0_u8; 2 * 1024 * 1024]).unwrap_err();
+        assert!(error.to_string().contains("rollout 4"), "{error}");
+    }
+    let store = Store::open(dir.path()).unwrap();
+    // What was written by a program with another idea of a rollout is passed over.
+    let found = store.rollouts::<String>().unwrap();
+    assert_eq!(found, [(2, "two".to_owned()), (10, "ten again".to_owned())]);
+    assert!(store.remove_rollout(2).unwrap());
+    assert!(!store.remove_rollout(2).unwrap());
+    assert_eq!(store.rollouts::<String>().unwrap().len(), 1);
+}
