@@ -12,6 +12,7 @@ use bumpless_deploy::{
 use bumpless_deploy::{
     Window,
     report::{CyclesView, ReplayReport, ShadowView, Trial, TrialReport},
+    rollout::{RolloutDraft, RolloutList, RolloutView},
 };
 use tokio::sync::broadcast;
 
@@ -46,6 +47,10 @@ pub(crate) trait Cell: Send + Sync + 'static {
     fn shadows(&self, id: LoopId) -> Answer<Vec<ShadowView>>;
     fn show_shadow(&self, id: LoopId, shadow: u64) -> Answer<ShadowView>;
     fn stop_shadow(&self, id: LoopId, shadow: u64) -> Answer<ShadowView>;
+    fn start_rollout(&self, draft: RolloutDraft) -> Answer<RolloutView>;
+    fn rollouts(&self) -> Answer<RolloutList>;
+    fn rollout(&self, id: String) -> Answer<RolloutView>;
+    fn stop_rollout(&self, id: String) -> Answer<RolloutView>;
     fn hosts(&self) -> Vec<HostView>;
     fn here(&self) -> HostId;
     fn points(&self) -> Answer<Vec<PointView>>;
@@ -179,6 +184,26 @@ impl Cell for Deploy {
     fn stop_shadow(&self, id: LoopId, shadow: u64) -> Answer<ShadowView> {
         let deploy = self.clone();
         Box::pin(async move { deploy.stop_shadow(&id, shadow).await })
+    }
+
+    fn start_rollout(&self, draft: RolloutDraft) -> Answer<RolloutView> {
+        let deploy = self.clone();
+        Box::pin(async move { deploy.start_rollout(draft).await })
+    }
+
+    fn rollouts(&self) -> Answer<RolloutList> {
+        let deploy = self.clone();
+        Box::pin(async move { Ok(deploy.rollouts().await) })
+    }
+
+    fn rollout(&self, id: String) -> Answer<RolloutView> {
+        let deploy = self.clone();
+        Box::pin(async move { deploy.rollout(&id).await })
+    }
+
+    fn stop_rollout(&self, id: String) -> Answer<RolloutView> {
+        let deploy = self.clone();
+        Box::pin(async move { deploy.stop_rollout(&id).await })
     }
 
     fn hosts(&self) -> Vec<HostView> {

@@ -4,7 +4,7 @@ use utoipa::OpenApi;
 
 use crate::{
     error::Problem,
-    routes::{bundle, components, history, hosts, live, loops, pages},
+    routes::{bundle, components, history, hosts, live, loops, pages, rollouts},
     types,
 };
 
@@ -22,6 +22,7 @@ use crate::{
         loops::setpoint, loops::mode, loops::output,
         history::cycles, history::replay, history::backtest,
         history::start_shadow, history::shadows, history::show_shadow, history::stop_shadow,
+        rollouts::start, rollouts::list, rollouts::show, rollouts::stop,
         hosts::list, hosts::points, live::feed,
         pages::healthz, pages::readyz, pages::metrics, pages::openapi,
     ),
@@ -31,6 +32,7 @@ use crate::{
         (name = "loops", description = "Controllers bound to points"),
         (name = "commands", description = "What an operator asks of a running loop; answered when a committed record holds it"),
         (name = "history", description = "Looking back: recorded cycles, replays, and candidates tried on them or beside a running loop"),
+        (name = "rollouts", description = "One component for many loops: one loop first, then the rest by rule"),
         (name = "cell", description = "Hosts, points and the live feed"),
         (name = "operation", description = "For supervisors and monitoring"),
     )

@@ -9,6 +9,7 @@ pub(crate) mod hosts;
 pub(crate) mod live;
 pub(crate) mod loops;
 pub(crate) mod pages;
+pub(crate) mod rollouts;
 
 use axum::{
     Router,
@@ -53,6 +54,9 @@ pub(crate) fn all() -> Router<App> {
             "/v1/loops/{name}/shadows/{id}",
             get(history::show_shadow).delete(history::stop_shadow),
         )
+        .route("/v1/rollouts", get(rollouts::list).post(rollouts::start))
+        .route("/v1/rollouts/{id}", get(rollouts::show))
+        .route("/v1/rollouts/{id}/stop", post(rollouts::stop))
         .route("/v1/hosts", get(hosts::list))
         .route("/v1/points", get(hosts::points))
         .route("/v1/live", get(live::feed))

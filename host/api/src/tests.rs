@@ -6,6 +6,7 @@
 mod fake;
 mod history;
 mod library;
+mod rollouts;
 
 use std::sync::{Arc, atomic::Ordering};
 

@@ -12,6 +12,7 @@ mod hosts;
 mod library;
 mod loops;
 mod record;
+mod rollouts;
 mod words;
 
 pub use call::{CallAnswer, CallRequest};
@@ -27,6 +28,7 @@ pub use loops::{
     Policy, RollbackRequest, SetRequest, SetpointRequest, SwapRequest, Tally,
 };
 pub use record::{Alarm, Applied, Event, LogLine, Message, Reading, Record};
+pub use rollouts::{OnFailure, Rollout, RolloutLoop, RolloutRequest, RolloutStage, RolloutState, Rollouts, SilentHost};
 pub use words::{Direction, LogLevel, Mode, OnBump, OnFault, PortKind, Priority, Quality, Strategy};
 
 pub(crate) use history::window;

@@ -19,10 +19,12 @@ use bumpless_deploy::{
         CurvePoint, CyclesView, Finding, IndexReport, OutputReport, ReplayReport, ShadowView, Skipped, StepTimes,
         Trial, TrialReport, Verdict,
     },
+    rollout::{RolloutDraft, RolloutList, RolloutView, State},
 };
 use serde_json::{Value, json};
 use tokio::sync::{Notify, broadcast};
 
+use super::rollouts::rollout;
 use crate::cell::{Answer, Cell};
 
 /// Records that a lagging reader still gets.
@@ -46,6 +48,7 @@ pub(crate) struct Fake {
     pub(crate) finished: Arc<AtomicUsize>,
     pub(crate) panics: AtomicBool,
     pub(crate) windows: Mutex<Vec<Window>>,
+    pub(crate) rollouts: Mutex<Vec<RolloutDraft>>,
     records: broadcast::Sender<Arc<Record>>,
 }
 
@@ -66,6 +69,7 @@ impl Fake {
             finished: Arc::default(),
             panics: AtomicBool::new(false),
             windows: Mutex::default(),
+            rollouts: Mutex::default(),
             records: broadcast::channel(FEED_CAPACITY).0,
         }
     }
@@ -96,15 +100,15 @@ impl Fake {
     }
 }
 
-fn digest() -> Digest {
+pub(super) fn digest() -> Digest {
     Digest::of(b"pid")
 }
 
-fn loop_id(name: &str) -> LoopId {
+pub(super) fn loop_id(name: &str) -> LoopId {
     LoopId::new(name).expect("valid")
 }
 
-fn host() -> HostId {
+pub(super) fn host() -> HostId {
     HostId::new("h").expect("valid")
 }
 
@@ -506,6 +510,26 @@ impl Cell for Fake {
 
     fn stop_shadow(&self, id: LoopId, number: u64) -> Answer<ShadowView> {
         self.answer(shadow(id, trial(), number))
+    }
+
+    fn start_rollout(&self, draft: RolloutDraft) -> Answer<RolloutView> {
+        self.rollouts.lock().unwrap().push(draft);
+        self.answer(rollout("h.3".into(), State::Running))
+    }
+
+    fn rollouts(&self) -> Answer<RolloutList> {
+        self.answer(RolloutList {
+            rollouts: vec![rollout("h.3".into(), State::Failed)],
+            silent: vec![(HostId::new("b").expect("valid"), "it did not answer".into())],
+        })
+    }
+
+    fn rollout(&self, id: String) -> Answer<RolloutView> {
+        self.answer(rollout(id, State::Failed))
+    }
+
+    fn stop_rollout(&self, id: String) -> Answer<RolloutView> {
+        self.answer(rollout(id, State::Stopped))
     }
 
     fn hosts(&self) -> Vec<HostView> {
