@@ -7,6 +7,7 @@
 //! | changes | what may change while a loop runs, what brings it back, and owners that die meanwhile |
 //! | members | frozen owners, late hosts, draining |
 //! | history | replays, backtests, shadows |
+//! | rollouts | one component for many loops, one loop first |
 //! | calls | the cell as a control service |
 //! | refusals | bad components, loops, requests, configurations, command lines |
 //! | modbus | a real Modbus device that dies and comes back |
@@ -34,6 +35,7 @@ mod modbus;
 mod neighbours;
 mod refusals;
 mod restarts;
+mod rollouts;
 mod story;
 mod watching;
 

@@ -9,9 +9,11 @@ use clap_complete::Shell;
 
 mod history;
 mod library;
+mod rollout;
 
-pub(crate) use history::{CandidateArgs, HistoryCommand};
+pub(crate) use history::HistoryCommand;
 pub(crate) use library::{ComponentsArgs, ComponentsCommand, FilterArgs, UploadArgs};
+pub(crate) use rollout::{RolloutArgs, RolloutCommand};
 
 use crate::{client::Client, commands, demo, error::Error, host, watch};
 
@@ -56,6 +58,11 @@ pub(crate) enum Command {
     Loop {
         #[command(subcommand)]
         what: LoopCommand,
+    },
+    /// One component for many loops: one loop first, then the rest by rule.
+    Rollout {
+        #[command(subcommand)]
+        what: RolloutCommand,
     },
     /// Run one step of a component somewhere in the cell.
     Call(CallArgs),
@@ -302,6 +309,7 @@ pub fn run(cli: Cli) -> Result<(), Error> {
             commands::components::run(&client()?, json, what.unwrap_or(ComponentsCommand::List(filter)))
         }
         Command::Loop { what } => commands::loops::run(&client()?, json, what),
+        Command::Rollout { what } => commands::rollouts::run(&client()?, json, what),
         Command::Call(args) => commands::components::call(&client()?, json, args),
         Command::Hosts => commands::hosts::list(&client()?, json),
         Command::Points => commands::hosts::points(&client()?, json),
@@ -355,6 +363,11 @@ mod tests {
             "bumpless loop rollback pressure --to 3",
             "bumpless loop cycles pressure",
             "bumpless loop replay pressure --last 10m",
+            "bumpless rollout start pid@1.1.0 pressure level --cycles 100 --factor 1.5 --at-once 2 --on-failure back --wait",
+            "bumpless rollout start pid --all-of pid@1.0.0 -p k=2 -p action=direct --json",
+            "bumpless rollout list",
+            "bumpless rollout show plant.3",
+            "bumpless rollout stop plant.3",
             "bumpless loop backtest pressure pidplus -p k=2 -p action=direct --last 5000 --plot x.svg",
             "bumpless loop shadow pressure pidplus --cycles 200 --wait",
             "bumpless loop shadows pressure 3 --stop",
@@ -378,6 +391,11 @@ mod tests {
             ("bumpless loop mode pressure fast", "[possible values: manual, auto]"),
             ("bumpless call pid --input pv=x", "\"x\" is no number"),
             ("bumpless call pid --strategy best", "use round-robin, random, cpu"),
+            ("bumpless rollout start pid", "<LOOP|--all-of <COMPONENT>>"),
+            (
+                "bumpless rollout start pid l --on-failure forth",
+                "[possible values: stop, back]",
+            ),
             ("bumpless lop", "'loop'"),
         ] {
             let error = parse(bad).expect_err(bad);
@@ -401,6 +419,7 @@ mod tests {
             "upload ",
             "components ",
             "loop ",
+            "rollout ",
             "call ",
             "hosts ",
             "watch ",

@@ -8,3 +8,4 @@ pub(crate) mod history;
 pub(crate) mod hosts;
 pub(crate) mod library;
 pub(crate) mod loops;
+pub(crate) mod rollouts;

@@ -14,7 +14,7 @@ use indicatif::ProgressBar;
 
 use super::{curves, loops};
 use crate::{
-    cli::{CandidateArgs, HistoryCommand},
+    cli::HistoryCommand,
     client::{Answer, Client, encoded},
     error::Error,
     show,
@@ -51,7 +51,7 @@ pub(crate) fn run(client: &Client, json: bool, what: HistoryCommand) -> Result<(
         }
         HistoryCommand::Backtest { name, candidate, last } => {
             let request = BacktestRequest {
-                parameters: parameters(client, &candidate)?,
+                parameters: parameters(client, &candidate.component, &candidate.parameters)?,
                 component: candidate.component,
                 last: Some(last),
                 from_unix_us: None,
@@ -67,7 +67,7 @@ pub(crate) fn run(client: &Client, json: bool, what: HistoryCommand) -> Result<(
             wait,
         } => {
             let request = ShadowRequest {
-                parameters: parameters(client, &candidate)?,
+                parameters: parameters(client, &candidate.component, &candidate.parameters)?,
                 component: candidate.component,
                 cycles,
             };
@@ -111,17 +111,21 @@ fn path(name: &str, rest: &str) -> String {
 }
 
 /// Numbers as they are, words as the candidate's choices have them.
-fn parameters(client: &Client, candidate: &CandidateArgs) -> Result<BTreeMap<String, f64>, Error> {
+pub(super) fn parameters(
+    client: &Client,
+    reference: &str,
+    given: &[(String, String)],
+) -> Result<BTreeMap<String, f64>, Error> {
     let mut component: Option<Component> = None;
     let mut values = BTreeMap::new();
-    for (key, text) in &candidate.parameters {
+    for (key, text) in given {
         let value = match text.parse() {
             Ok(number) => number,
             Err(_) => {
                 let known = match component.take() {
                     Some(known) => known,
                     None => client
-                        .get(&format!("/v1/components/{}", encoded(&candidate.component)))?
+                        .get(&format!("/v1/components/{}", encoded(reference)))?
                         .decode()?,
                 };
                 loops::choice(component.insert(known), key, text)?

@@ -20,5 +20,6 @@ mod library;
 mod lifetime;
 mod orders;
 mod real;
+mod rollouts;
 mod trials;
 mod uploads;
