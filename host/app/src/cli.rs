@@ -22,7 +22,8 @@ const API_DEFAULT: &str = "http://127.0.0.1:8480";
 
 /// A WebAssembly-sandboxed controller host: swap controllers, lose hosts, and the actuator does not feel it.
 ///
-/// Exit codes: 0 done, 1 failed, 2 wrong command line, 3 refused by the cell (nothing changed), 4 API not reachable.
+/// Exit codes: 0 done, 1 failed, 2 wrong command line, 3 refused by the cell (nothing changed) or a rollout that failed, 4 API
+/// not reachable.
 #[derive(Debug, Parser)]
 #[command(name = "bumpless", version, propagate_version = true, max_term_width = 110)]
 pub struct Cli {

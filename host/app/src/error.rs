@@ -5,7 +5,7 @@
 //! | 0 | done |
 //! | 1 | failed |
 //! | 2 | the command line is wrong (clap) |
-//! | 3 | the cell refused; nothing changed |
+//! | 3 | the cell refused; nothing changed (of a rollout that failed: what its report says) |
 //! | 4 | the API could not be reached |
 
 use std::{io, path::PathBuf};

@@ -14,7 +14,7 @@ use std::{
 use bumpless_core::{Digest, LoopId};
 use parking_lot::Mutex;
 use serde::{Deserialize, Serialize};
-use tokio::sync::Notify;
+use tokio::sync::{Notify, oneshot};
 
 use super::{
     LegView, RolloutDraft, RolloutView, Stage, State,
@@ -23,6 +23,7 @@ use super::{
     watch::Eye,
 };
 use crate::{
+    bench::stopping,
     book::on_disk,
     error::{Error, Words, chain},
     library::title,
@@ -205,8 +206,18 @@ impl Room {
         Ok(())
     }
 
-    /// Begins a rollout.
+    /// Begins a rollout, in a task of its own: an asker that goes away must leave none on disk that nobody goes on with.
     pub(crate) async fn start_rollout(self: &Arc<Self>, draft: RolloutDraft) -> Result<RolloutView, Error> {
+        let room = Arc::clone(self);
+        let (sender, receiver) = oneshot::channel();
+        self.spawn(async move {
+            // The asker may have gone.
+            let _ = sender.send(room.begin_rollout(draft).await);
+        });
+        receiver.await.map_err(|_| stopping())?
+    }
+
+    async fn begin_rollout(self: &Arc<Self>, draft: RolloutDraft) -> Result<RolloutView, Error> {
         draft.rule.check()?;
         let info = self.library.resolve(&draft.component)?;
         let given = draft.parameters.iter().map(|(name, value)| (name.as_str(), *value));

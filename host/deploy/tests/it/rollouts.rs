@@ -8,6 +8,7 @@ use bumpless_deploy::{
     rollout::{OnFailure, RolloutDraft, RolloutView, Rule, Stage, State},
 };
 
+use crate::field::Script;
 use crate::harness::{Cell, Host, PATIENCE, component, draft, id, until};
 
 const LOOPS: [&str; 3] = ["a", "b", "c"];
@@ -263,6 +264,42 @@ async fn it_goes_on_after_a_restart_of_its_host_and_stays_stopped() {
     assert_eq!(shown.state, State::Stopped);
     assert!(runs(&io, "c").starts_with("pid@"));
     io.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_change_that_a_restart_cuts_off_is_asked_for_again_and_after_a_stop_it_is_not() {
+    for stop in [false, true] {
+        let cell = Cell::new();
+        let io = three_loops(&cell).await;
+        io.field.script(Script::Ignore);
+        let begun = io.deploy.start_rollout(wanted(&["a", "b"])).await.unwrap();
+        until("the change is under way", || {
+            cycle(&io);
+            io.deploy.loop_view(&id("a")).unwrap().pending
+        })
+        .await;
+        if stop {
+            let told = io.deploy.stop_rollout(&begun.id).await.unwrap();
+            assert_eq!(told.state, State::Running, "what was asked for is not known yet");
+        }
+        io.stop().await;
+        let io = cell.io("io", true).await;
+        until("the homes are open", || {
+            LOOPS.iter().all(|name| io.field.home(name).is_some()).then_some(())
+        })
+        .await;
+        let end = until_it(&io, &begun.id, "its end", |view| view.ended_at_unix_ms.is_some()).await;
+        let (state, stage, component) = if stop {
+            (State::Stopped, Stage::Waiting, "pid@")
+        } else {
+            (State::Done, Stage::Done, "pidplus@")
+        };
+        assert_eq!((end.state, stages(&end)), (state, vec![stage; 2]), "{end:?}");
+        for name in ["a", "b"] {
+            assert!(runs(&io, name).starts_with(component), "{name}: {}", runs(&io, name));
+        }
+        io.stop().await;
+    }
 }
 
 #[tokio::test(flavor = "multi_thread")]
