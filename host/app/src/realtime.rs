@@ -4,10 +4,14 @@
 //! Linux SCHED_FIFO   30   bl-epoch     stops a guest that spins, so it goes before the guest
 //!                    20   loops-n      a cycle's own work, some tens of µs at a time
 //!                         tx-n, rx-n, net-n, acc-n, app-n   the bus: what carries a cycle between hosts
+//!                    10   record-writer, cycle-writer, io-journal, loops-reaper: they take what a cycle leaves
 //! usual class, nice −10   all others: API, deployment, field buses, disk
 //! ```
 //! Loops and bus have one priority: they share locks, and a thread that finds one taken yields to its equals alone. With
-//! loops above the bus a remote step costs six times the processor time.
+//! loops above the bus a remote step costs six times the processor time. Whoever takes from a queue that a cycle fills is in
+//! the class too: a sender that meets a receiver in the middle of its work yields until it is done, and would never let a thread
+//! of the usual class get there.
+//!
 //! A machine that compiles, or on which another host starts, then delays a cycle by microseconds instead of milliseconds.
 //! Threads that a thread makes later inherit its class.
 //!
@@ -26,11 +30,16 @@ use crate::error::Error;
 const NICE: i32 = -10;
 /// Real-time priority of everything that a cycle crosses: in the lower half, below what a machine's own drivers use.
 const CYCLE: i32 = 20;
+/// Real-time priority of the threads that take what a cycle leaves: behind it, and before everything else.
+const TAKER: i32 = 10;
 /// Classes by the beginning of a thread's name. Source of the bus's names: zenoh-runtime, `ZRuntime`.
-const PRIORITIES: [(&str, i32); 8] = [
+const PRIORITIES: [(&str, i32); 11] = [
     ("bl-epoch", 30),
     // Before "loops-": it only drops memory.
-    ("loops-reaper", 0),
+    ("loops-reaper", TAKER),
+    ("record-writer", TAKER),
+    ("cycle-writer", TAKER),
+    ("io-journal", TAKER),
     ("loops-", CYCLE),
     ("tx-", CYCLE),
     ("rx-", CYCLE),
@@ -157,7 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn every_thread_has_a_name_and_the_reaper_no_class() {
+    fn every_thread_has_a_name_and_the_reaper_goes_behind_the_loops() {
         assert!(threads().unwrap().iter().any(|(_, name)| !name.is_empty()));
         let class = |name: &str| {
             PRIORITIES
@@ -167,7 +176,7 @@ mod tests {
         };
         assert_eq!(
             (class("loops-0"), class("loops-reaper"), class("async")),
-            (Some(20), Some(0), None)
+            (Some(CYCLE), Some(TAKER), None)
         );
     }
 

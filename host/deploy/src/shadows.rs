@@ -10,10 +10,10 @@
 //! ```
 
 use std::{
+    collections::VecDeque,
     sync::{
         Arc,
         atomic::{AtomicBool, AtomicU64, Ordering},
-        mpsc::{Receiver, SyncSender, TryRecvError, TrySendError, sync_channel},
     },
     time::Duration,
 };
@@ -40,6 +40,10 @@ const QUEUE_MAX: usize = 1024;
 
 /// How often a shadow looks for records. It is not woken, because to wake costs the waker a system call.
 const LOOK_EVERY: Duration = Duration::from_millis(20);
+
+/// Records on their way to a shadow. The cycle's thread looks once whether the lock is free and never waits for it: whoever has
+/// it runs at the lowest priority, and a channel's way of waiting, to yield and look again, would never let that one run.
+type Queue = Mutex<VecDeque<Arc<Record>>>;
 
 /// What a shadow found.
 enum Desk {
@@ -80,7 +84,7 @@ struct Shadow {
 struct Route {
     id: u64,
     loop_id: LoopId,
-    queue: SyncSender<Arc<Record>>,
+    queue: Arc<Queue>,
     missed: Arc<AtomicU64>,
     running: Arc<AtomicBool>,
 }
@@ -127,8 +131,9 @@ impl Shadows {
     pub(crate) fn pass(&self, record: &Arc<Record>) {
         let routes = Arc::clone(&self.routes.read());
         for route in routes.iter().filter(|route| route.loop_id == record.loop_id) {
-            let full = matches!(route.queue.try_send(Arc::clone(record)), Err(TrySendError::Full(_)));
-            if full && route.running.load(Ordering::Relaxed) {
+            let queue = route.queue.try_lock().filter(|queue| queue.len() < QUEUE_MAX);
+            let passed = queue.map(|mut queue| queue.push_back(Arc::clone(record))).is_some();
+            if !passed && route.running.load(Ordering::Relaxed) {
                 route.missed.fetch_add(1, Ordering::Relaxed);
             }
         }
@@ -167,7 +172,8 @@ impl Shadows {
                 "stop one, or wait for its end",
             ));
         }
-        let (queue, records) = sync_channel(QUEUE_MAX);
+        let queue = Arc::new(Queue::default());
+        let records = Arc::clone(&queue);
         let shadow = Shadow {
             id: self.ids.fetch_add(1, Ordering::Relaxed) + 1,
             loop_id,
@@ -261,19 +267,23 @@ fn missing(loop_id: &LoopId, id: u64) -> Error {
 }
 
 /// A shadow's life.
-fn follow(records: &Receiver<Arc<Record>>, desk: &Mutex<Desk>, recorded: Digest, cycles: u64) {
+fn follow(records: &Arc<Queue>, desk: &Mutex<Desk>, recorded: Digest, cycles: u64) {
+    // All at once, so that the lock is held for the time of a swap.
+    let mut taken = VecDeque::new();
     loop {
-        let record = match records.try_recv() {
-            Ok(record) => record,
-            Err(TryRecvError::Empty) => {
-                std::thread::sleep(LOOK_EVERY);
-                continue;
-            }
-            Err(TryRecvError::Disconnected) => {
+        let Some(record) = taken.pop_front() else {
+            // Before the look, so that nothing comes between.
+            let alone = Arc::strong_count(records) == 1;
+            std::mem::swap(&mut taken, &mut *records.lock());
+            if taken.is_empty() && alone {
                 return desk
                     .lock()
                     .end("its loop was deleted, or the loop's home stopped", false);
             }
+            if taken.is_empty() {
+                std::thread::sleep(LOOK_EVERY);
+            }
+            continue;
         };
         // Taken per record, so that whoever looks at it waits for one step at most.
         let mut desk = desk.lock();
