@@ -392,7 +392,7 @@ mod tests {
             ("bumpless loop mode pressure fast", "[possible values: manual, auto]"),
             ("bumpless call pid --input pv=x", "\"x\" is no number"),
             ("bumpless call pid --strategy best", "use round-robin, random, cpu"),
-            ("bumpless rollout start pid", "<LOOP|--all-of <COMPONENT>>"),
+            ("bumpless rollout start pid", "<LOOP>..."),
             (
                 "bumpless rollout start pid l --on-failure forth",
                 "[possible values: stop, back]",
