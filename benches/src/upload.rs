@@ -45,6 +45,9 @@ const BOMB_BYTES: usize = 31 * 1024 * 1024;
 /// Uploads that come at once.
 const CROWD: u64 = 100;
 
+/// Longest wait for a component to be compiled by four hosts on one machine.
+const READY_MAX: Duration = Duration::from_secs(300);
+
 /// Times of a round, in ns since 1970.
 type Span = (u64, u64);
 
@@ -182,11 +185,30 @@ fn upload_to_running(api: &Api, history: &History, bytes: &[u8]) -> Result<u64, 
     let (place, started) = (history.place(), Instant::now());
     let uploaded = api.upload_bytes(bytes)?;
     let digest = uploaded["digest"].as_str().unwrap_or_default().to_owned();
+    wait_ready(api, &digest)?;
     api.swap(CHANGED, &digest)?;
     history.wait("the first cycle of an uploaded component", place, |record| {
         record.digest == digest
     })?;
     Ok(u64::try_from(started.elapsed().as_nanos()).unwrap_or(u64::MAX))
+}
+
+/// Waits until every controller has it compiled: a large one takes longer than a swap waits.
+fn wait_ready(api: &Api, digest: &str) -> Result<(), Error> {
+    let started = Instant::now();
+    loop {
+        let shown = api.get(&format!("/v1/components/{digest}"))?;
+        if shown["ready_on"].as_array().is_some_and(|hosts| hosts.len() >= 4) {
+            return Ok(());
+        }
+        if started.elapsed() > READY_MAX {
+            return Err(Error::Waited {
+                what: "a component ready on every host".to_owned(),
+                seconds: READY_MAX.as_secs(),
+            });
+        }
+        std::thread::sleep(Duration::from_millis(5));
+    }
 }
 
 /// How far two writes of the watched actuator are from one period apart, in ns, without the machine's stalls.

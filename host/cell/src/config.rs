@@ -48,10 +48,11 @@ fn listen_default() -> Vec<String> {
     vec!["tcp/127.0.0.1:0".to_owned()]
 }
 
-/// Longer than a busy or virtual machine stalls (2.4 s were seen), because links that are given up cost more than a frozen
-/// host that is believed alive: owners and replicas are judged by their own silence, within a cycle.
+/// Well beyond what a busy or virtual machine, or a person with a debugger, stops a process for (2.4 s were seen), because links
+/// that are given up and made again cost the cycles of every host more than a frozen host that is believed alive: owners and
+/// replicas are judged by their own silence, within a cycle.
 const fn lease_ms_default() -> u64 {
-    5000
+    10_000
 }
 
 impl Config {

@@ -164,7 +164,8 @@ impl Shadows {
         let mut all = self.all.lock();
         let following = all
             .iter()
-            .filter(|shadow| shadow.running.load(Ordering::Acquire))
+            // As it is shown: its thread may still be on its way out when the view already says that it ended.
+            .filter(|shadow| shadow.view(false).ended.is_none())
             .count();
         if following >= SHADOWS_MAX {
             return Err(Error::busy(
@@ -198,7 +199,7 @@ impl Shadows {
         self.reroute(|route| route.running.load(Ordering::Acquire), Some(route));
         let view = shadow.view(false);
         all.push(shadow);
-        let ended = |shadow: &&Shadow| !shadow.running.load(Ordering::Acquire);
+        let ended = |shadow: &&Shadow| shadow.view(false).ended.is_some();
         let ended: Vec<u64> = all.iter().filter(ended).map(|shadow| shadow.id).collect();
         let extra = ended.len().saturating_sub(ENDED_KEPT_MAX);
         all.retain(|shadow| !ended.iter().take(extra).any(|id| *id == shadow.id));
