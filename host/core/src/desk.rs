@@ -89,7 +89,7 @@ pub enum Queued {
 }
 
 /// One loop at its home.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct Desk {
     home: HostId,
     spec: Arc<LoopSpec>,
