@@ -330,7 +330,7 @@ mod tests {
                             what: String::new()
                         };
                         HISTORY_MAX + 1
-                    ]
+                    ];
                 },
                 "17 entries",
             ),
