@@ -409,7 +409,7 @@ mod tests {
         assert_eq!(config.api_listen.to_string(), "127.0.0.1:8480");
         assert_eq!(config.data, Path::new("/etc/bumpless/data"));
         assert_eq!(config.cell.listen, ["tcp/127.0.0.1:0"]);
-        assert_eq!(config.cell.lease_ms, 5000);
+        assert_eq!(config.cell.lease_ms, 10_000);
         assert_eq!(
             config.engine.limits.memory_bytes_max,
             bumpless_engine::Limits::default().memory_bytes_max
