@@ -25,7 +25,7 @@ use crate::{
 };
 
 /// The version that this host writes and reads.
-pub const VERSION: u8 = 2;
+pub const VERSION: u8 = 1;
 
 /// What can be sent. The bound and the checks of each message stand beside its name.
 pub trait Letter: Serialize + DeserializeOwned {
