@@ -149,8 +149,11 @@ fn a_component_that_keeps_failing_gives_way_to_the_loops_fallback() {
         whole(&fallback["seq"]) > whole(&held["seq"]) + 3,
         "after more faults than the loop tolerates"
     );
-    let view = api.loop_view(LOOP).unwrap();
-    assert!(text(&view["component"]).starts_with("pid@"), "{view}");
+    // The record is first; the loop's intent follows it.
+    api.wait_for_loop(LOOP, "the fallback in force", |view| {
+        text(&view["component"]).starts_with("pid@")
+    })
+    .unwrap();
     feed.record_where("good cycles again", |r| {
         whole(&r["revision"]) > failing && event(r, "faulted").is_none() && settled(r)
     })
