@@ -155,7 +155,7 @@ fn a_component_that_keeps_failing_gives_way_to_the_loops_fallback() {
     })
     .unwrap();
     feed.record_where("good cycles again", |r| {
-        whole(&r["revision"]) > failing && event(r, "faulted").is_none() && settled(r)
+        whole(&r["revision"]) > failing && event(r, "faulted").is_none() && event(r, "revised").is_none()
     })
     .unwrap();
     assert!(
