@@ -222,6 +222,9 @@ impl Worker {
             Some(fault) => Err(fault),
             None => old.instance.step(&running.frame, &running.state, limit_ns),
         };
+        if let Err(fault) = &old_step {
+            seat.remember_overrun(&running, fault);
+        }
         let attempt = match seat.held.iter().position(|h| h.spec.revision == revision) {
             Some(new_index) if new_index != old_index => {
                 try_revision(seat, old_index, new_index, &running, old_step.as_ref().ok())

@@ -76,6 +76,14 @@ impl Seat {
         self.held.iter_mut().find(|h| h.spec.revision == revision)
     }
 
+    /// A step that runs past its limit may end too late for its cycle; then the next one must not try it again, or nobody
+    /// would ever hear of it: no record, no policy, no way back, and no other revision either.
+    pub(crate) fn remember_overrun(&mut self, running: &Running, fault: &Fault) {
+        if matches!(fault, Fault::Overrun { .. }) {
+            self.overran = Some((running.sample.revision, running.sample.last, fault.clone()));
+        }
+    }
+
     pub(crate) fn waits_for(&self, host: &HostId) -> bool {
         self.running
             .as_ref()
@@ -345,7 +353,9 @@ impl Worker {
                         }
                         Err(fault) => {
                             let replica = self.shared.here.clone();
-                            self.remember_overrun(id, &running, &fault);
+                            if let Some(seat) = self.seats.get_mut(id) {
+                                seat.remember_overrun(&running, &fault);
+                            }
                             running.events.push(CycleEvent::Faulted {
                                 replica,
                                 fault: fault.to_string(),
@@ -366,14 +376,6 @@ impl Worker {
                     return self.wait(id, running, until_ns);
                 }
             }
-        }
-    }
-
-    /// A step that runs past its limit may end too late for its cycle; then the next one must not try it again, or nobody
-    /// would ever hear of it: no record, no policy, no way back.
-    fn remember_overrun(&mut self, id: &LoopId, running: &Running, fault: &Fault) {
-        if let (Fault::Overrun { .. }, Some(seat)) = (fault, self.seats.get_mut(id)) {
-            seat.overran = Some((running.sample.revision, running.sample.last, fault.clone()));
         }
     }
 
@@ -454,7 +456,9 @@ impl Worker {
             Err(fault) => {
                 // A host that is not ready is no worse for it, only of no use now; a fault is the component's.
                 self.shared.replicas.answered(&asked.host, latency_ns);
-                self.remember_overrun(&id, &running, &fault);
+                if let Some(seat) = self.seats.get_mut(&id) {
+                    seat.remember_overrun(&running, &fault);
+                }
                 running.events.push(CycleEvent::Faulted {
                     replica: asked.host,
                     fault: fault.to_string(),

@@ -114,9 +114,11 @@ fn a_step_that_spins_beyond_its_cycle_is_heard_of_in_a_later_one() {
     assert_eq!((back.revision, back.faults_in_row), (1, 0));
     assert!(reason(&back).contains("ran past its limit"), "{}", reason(&back));
 
-    // Without a probation the loop's policy gets its say.
+    // Without a probation the loop's policy gets its say, and a better revision comes in.
     let mut spec = bench.spec("guests/spins", 3, &[("after", 5.0)]);
     (spec.policy.step_limit_us, spec.policy.probation_cycles) = (20_000, 0);
     assert_eq!(bench.revise(&spec).0, Outcome::Done);
     bench.until("faults are counted", |r| r.revision == 3 && r.faults_in_row == 3);
+    let (outcome, record) = bench.revise(&bench.spec("pid", 4, &[("k", 2.0), ("ti", 0.5)]));
+    assert_eq!((outcome, record.revision), (Outcome::Done, 4));
 }
