@@ -205,7 +205,7 @@ pub(crate) fn run(options: Options, switching: Switching, report: &mut Report) -
     let before = Tally::ask(&api, LOOP)?;
     let from_ns = clock.now_ns();
     let killer = Killer::start(cell, switching.kill, Arc::clone(&history))?;
-    let mut refused = 0_u64;
+    let (mut refused, mut unchanged) = (0_u64, 0_u64);
     let mut last_refusal = String::new();
     let plus = "pidplus";
     // The same law twice, then another law and back.
@@ -220,7 +220,8 @@ pub(crate) fn run(options: Options, switching: Switching, report: &mut Report) -
             drop(api.setpoint(LOOP, if number % 16 == 0 { 60.0 } else { 40.0 }));
         }
         match api.swap(LOOP, to) {
-            Ok(_) => {}
+            // After a refusal the loop may run already what the next swap asks for.
+            Ok(end) => unchanged += u64::from(end["unchanged"] == true),
             Err(error) => {
                 refused += 1;
                 last_refusal = error.to_string();
@@ -256,7 +257,15 @@ pub(crate) fn run(options: Options, switching: Switching, report: &mut Report) -
     report.told("swap.rate", switching.hz(), "Hz");
     report.told("swap.kills", kills as f64, "kills");
     let seen = history.between(LOOP, from_ns, to_ns);
-    tell_switches(report, &seen, &[&pid, &twin], count, refused, switching.kill);
+    report.told("swap.nothing_to_change", unchanged as f64, "swaps");
+    tell_switches(
+        report,
+        &seen,
+        &[&pid, &twin],
+        count - unchanged.min(count),
+        refused,
+        switching.kill,
+    );
     if refused > 0 {
         report.progress(&format!("the last swap that was not taken: {last_refusal}"));
     }

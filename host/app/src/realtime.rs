@@ -8,7 +8,7 @@
 //! usual class, nice −10   all others: API, deployment, field buses, disk
 //! ```
 //! Loops and bus have one priority: they share locks, and a thread that finds one taken yields to its equals alone. With
-//! loops above the bus a remote step costs six times the processor time. Whoever takes from a queue that a cycle fills is in
+//! loops above the bus a remote step took six times the processor time that it takes in the usual class. Whoever takes from a queue that a cycle fills is in
 //! the class too: a sender that meets a receiver in the middle of its work yields until it is done, and would never let a thread
 //! of the usual class get there.
 //!
