@@ -12,6 +12,8 @@ pub enum Quality {
     Uncertain,
     /// Usable.
     Good,
+    /// Usable; a person put it there in the place of the instrument's or the loop's own.
+    Forced,
 }
 
 /// Why there is no current value.

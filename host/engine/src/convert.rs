@@ -23,7 +23,8 @@ pub(crate) fn reading(reading: &Reading, at_ns: u64) -> io::Reading {
     let quality = match (value, reading.quality) {
         (None, _) | (_, Quality::Bad) => types::Quality::Bad,
         (_, Quality::Uncertain) => types::Quality::Uncertain,
-        (_, Quality::Good) => types::Quality::Good,
+        // What a person forces is meant to be acted on; the components' interface knows no more than "usable".
+        (_, Quality::Good | Quality::Forced) => types::Quality::Good,
     };
     let last_good = if reading.last_good.is_finite() {
         reading.last_good

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use bumpless_core::PointId;
+use bumpless_core::{BusId, PointId};
 
 /// What can go wrong with points and buses.
 #[derive(Debug, thiserror::Error)]
@@ -55,6 +55,34 @@ pub enum Error {
         low: f64,
         /// Greatest value.
         high: f64,
+    },
+    /// A force whose time is over before it begins, or too long.
+    #[error("point {point}: a force lasts from 1 s to 24 h; {seconds} s were asked for")]
+    ForceTime {
+        /// The point.
+        point: PointId,
+        /// Seconds from now.
+        seconds: u64,
+    },
+    /// No room for another force.
+    #[error("{} points are forced; end a force before the next", crate::limits::FORCES_MAX)]
+    TooManyForces,
+    /// No bus of that name.
+    #[error("this host has no bus {0:?}")]
+    NoSuchBus(String),
+    /// A bus without registers.
+    #[error("bus {0:?} is no Modbus device: it has points, and no registers to read or write")]
+    NoRegisters(BusId),
+    /// The bus's queue is full.
+    #[error("bus {0:?}: too many requests wait for the device; try again")]
+    ErrandsFull(BusId),
+    /// Nobody at an address.
+    #[error("{address}: {problem}; check the address, the cable and the device")]
+    Unreachable {
+        /// `host:port`.
+        address: String,
+        /// What the system said.
+        problem: String,
     },
     /// A write after the end.
     #[error("the I/O of this host is closed; nothing was written")]

@@ -4,8 +4,11 @@
 //! at_ns,point,value,loop,term,seq
 //! 1790000000000000000,plant.p2,4.25,pressure,1,17
 //! #refused,1790000000100000000,plant.p2,11,pressure,1,18,point plant.p2: 11 V is outside 0 to 10; nothing was written
+//! #forced,1790000000200000000,plant.p2,5,pressure,1,19,asked 4.25
 //! #dropped,0
 //! ```
+//!
+//! `#forced` is a commit whose value a force replaced: the actuator got the first number, the loop asked for the last.
 //!
 //! Lines reach the file within `JOURNAL_FLUSH_MS`. The queue is bounded; when it is full the line is dropped and counted,
 //! and the last line of a file that was closed in order says how many were.
@@ -46,8 +49,19 @@ pub struct Line {
     pub term: u64,
     /// Its cycle.
     pub seq: u64,
-    /// Why it was refused; none where it was taken.
-    pub refused: Option<String>,
+    /// What became of it.
+    pub end: LineEnd,
+}
+
+/// What became of a write.
+#[derive(Debug, Clone, PartialEq)]
+pub enum LineEnd {
+    /// The actuator got the value.
+    Taken,
+    /// The actuator got the value, for a person forces it; this is what the loop asked for.
+    Forced(f64),
+    /// Nothing was written, and why.
+    Refused(String),
 }
 
 impl Line {
@@ -59,11 +73,17 @@ impl Line {
             loop_id,
             term,
             seq,
-            refused,
+            end,
         } = self;
-        match refused {
-            None => writeln!(out, "{at_ns},{point},{value},{loop_id},{term},{seq}"),
-            Some(reason) => {
+        match end {
+            LineEnd::Taken => writeln!(out, "{at_ns},{point},{value},{loop_id},{term},{seq}"),
+            LineEnd::Forced(asked) => {
+                writeln!(
+                    out,
+                    "#forced,{at_ns},{point},{value},{loop_id},{term},{seq},asked {asked}"
+                )
+            }
+            LineEnd::Refused(reason) => {
                 // A reason is one field to the end of the line.
                 let reason = reason.replace(['\n', '\r'], " ");
                 writeln!(out, "#refused,{at_ns},{point},{value},{loop_id},{term},{seq},{reason}")
@@ -173,7 +193,7 @@ mod tests {
     #![allow(clippy::unwrap_used, reason = "tests")]
     use super::*;
 
-    fn line(seq: u64, refused: Option<&str>) -> Line {
+    fn line(seq: u64, end: LineEnd) -> Line {
         Line {
             at_ns: 1000 + seq,
             point: PointId::new("plant.p2").unwrap(),
@@ -181,7 +201,7 @@ mod tests {
             loop_id: LoopId::new("pressure").unwrap(),
             term: 3,
             seq,
-            refused: refused.map(str::to_owned),
+            end,
         }
     }
 
@@ -191,15 +211,16 @@ mod tests {
         let path = folder.path().join("writes.csv");
         let journal = Journal::open("plant", &path).unwrap();
         for seq in 0..10_000 {
-            journal.note(line(seq, None));
+            journal.note(line(seq, LineEnd::Taken));
         }
-        journal.note(line(10_000, Some("no,\nreally")));
+        journal.note(line(10_000, LineEnd::Refused("no,\nreally".to_owned())));
+        journal.note(line(10_001, LineEnd::Forced(5.5)));
         journal.close();
         journal.close();
-        journal.note(line(1, None));
+        journal.note(line(1, LineEnd::Taken));
         let text = std::fs::read_to_string(&path).unwrap();
         let lines: Vec<&str> = text.lines().collect();
-        assert_eq!(lines.len(), 10_003);
+        assert_eq!(lines.len(), 10_004);
         assert_eq!(lines[0], "at_ns,point,value,loop,term,seq");
         assert_eq!(lines[1], "1000,plant.p2,4.25,pressure,3,0");
         assert_eq!(lines[10_000], "10999,plant.p2,4.25,pressure,3,9999");
@@ -207,7 +228,8 @@ mod tests {
             lines[10_001],
             "#refused,11000,plant.p2,4.25,pressure,3,10000,no, really"
         );
-        assert_eq!(lines[10_002], "#dropped,0");
+        assert_eq!(lines[10_002], "#forced,11001,plant.p2,4.25,pressure,3,10001,asked 5.5");
+        assert_eq!(lines[10_003], "#dropped,0");
         assert_eq!(journal.dropped(), 0);
     }
 
@@ -229,7 +251,7 @@ mod tests {
             }
         }
         let (sender, receiver) = bounded(4);
-        sender.send(line(0, None)).unwrap();
+        sender.send(line(0, LineEnd::Taken)).unwrap();
         assert!(keep(&receiver, &mut Dead, &AtomicU64::new(0)).is_err());
     }
 }

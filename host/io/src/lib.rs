@@ -13,10 +13,16 @@
 
 pub mod clock;
 pub mod config;
+pub mod errand;
 pub mod error;
+pub mod force;
 pub mod image;
+pub mod job;
 pub mod limits;
+pub mod point_list;
+pub mod request_map;
 pub mod scaling;
+pub mod scan;
 pub mod server;
 pub mod status;
 
@@ -26,6 +32,9 @@ pub mod sim;
 
 pub use clock::Clock;
 pub use config::{BusConfig, Config, OnStop};
+pub use errand::{Errand, ErrandError};
 pub use error::Error;
+pub use force::Force;
+pub use job::{JobConfig, JobStep};
 pub use server::{IoServer, PointIndex, PointInfo, WriteStamp};
 pub use status::BusStatus;

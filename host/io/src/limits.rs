@@ -20,6 +20,30 @@ pub const PLANT_CATCH_UP_MS_MAX: u64 = 20_000;
 /// Longest dead time of a simulated loop, in s.
 pub const DEAD_TIME_S_MAX: f64 = 600.0;
 
+/// Points forced at a time: forces are for commissioning and repair, and a person must be able to overlook them.
+pub const FORCES_MAX: usize = 256;
+
+/// Longest time of one force, in ns: 24 h, so that none is forgotten over a weekend.
+pub const FORCE_NS_MAX: u64 = 24 * 3_600_000_000_000;
+
+/// Errands that wait for one bus: jobs send one at a time, people some more.
+pub const ERRANDS_WAITING_MAX: usize = 16;
+
+/// Named jobs of one bus: they fit on a page.
+pub const JOBS_PER_BUS_MAX: usize = 64;
+
+/// Steps of one job: an instrument's whole set-up.
+pub const JOB_STEPS_MAX: usize = 256;
+
+/// Longest time of one job, in ms: one hour.
+pub const JOB_MS_MAX: u64 = 3_600_000;
+
+/// Requests of one scan: at 10 ms each, a minute and a half.
+pub const SCAN_REQUESTS_MAX: u32 = 8_000;
+
+/// Units of one scan: all that there are.
+pub const SCAN_UNITS_MAX: usize = 256;
+
 /// Journal lines that may wait for the disk: at 10,000 writes a second, six seconds of a disk that hangs.
 pub const JOURNAL_LINES_WAITING_MAX: usize = 65_536;
 

@@ -51,6 +51,7 @@ use serde::{Deserialize, Serialize};
 use crate::{
     Error,
     config::OnStop,
+    job::{self, JobConfig},
     limits::{
         BACKOFF_MS_RANGE, POINTS_MAX, POLL_PERIOD_MS_MAX, POLL_PERIOD_MS_MIN, REGISTERS_PER_READ_MAX, TIMEOUT_MS_RANGE,
     },
@@ -106,6 +107,9 @@ pub struct ModbusConfig {
     /// Order of bytes of the points that name none.
     #[serde(default)]
     pub byte_order: ByteOrder,
+    /// Sequences of requests that can be started by name.
+    #[serde(default, rename = "job", skip_serializing_if = "Vec::is_empty")]
+    pub jobs: Vec<JobConfig>,
     /// The points.
     #[serde(default, rename = "point", skip_serializing_if = "Vec::is_empty")]
     pub points: Vec<ModbusPoint>,
@@ -233,6 +237,8 @@ pub(crate) struct Plan {
     pub(crate) write_repeat_ms: u64,
     pub(crate) write_with: WriteWith,
     pub(crate) on_stop: OnStop,
+    pub(crate) unit_id: u8,
+    pub(crate) jobs: Vec<JobConfig>,
     pub(crate) points: Vec<PlannedPoint>,
     pub(crate) groups: Vec<group::Group>,
 }
@@ -279,6 +285,7 @@ impl ModbusConfig {
                 self.points.len()
             ));
         }
+        job::check_all(&bus, &self.jobs)?;
         let mut points = Vec::with_capacity(self.points.len());
         let mut infos = Vec::with_capacity(self.points.len());
         for point in &self.points {
@@ -304,6 +311,8 @@ impl ModbusConfig {
             write_repeat_ms: self.write_repeat_ms,
             write_with: self.write_with,
             on_stop: self.on_stop,
+            unit_id: self.unit_id,
+            jobs: self.jobs.clone(),
             points,
             groups,
         };

@@ -9,15 +9,18 @@
 
 use std::collections::HashMap;
 
-use bumpless_core::{BusId, LoopId, PointId, PortKind, Reading};
+use bumpless_core::{BusId, LoopId, PointId, PortKind, Quality, Reading};
 use parking_lot::RwLock;
 use serde::Serialize;
 
 use crate::{
     BusStatus, Clock, Error,
     config::{BusConfig, Config},
-    limits::{BUSES_MAX, POINTS_MAX},
-    modbus::{Plan, driver::ModbusDriver},
+    errand::{self, Asked, Errand},
+    force::{Force, Forces},
+    job::JobConfig,
+    limits::{BUSES_MAX, FORCE_NS_MAX, POINTS_MAX},
+    modbus::{Plan, PlannedPoint, driver::ModbusDriver},
     sim::driver::SimDriver,
 };
 
@@ -65,6 +68,28 @@ pub struct WriteStamp {
     pub seq: u64,
 }
 
+/// One checked value on its way to a driver.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Put {
+    /// The point's number on its bus.
+    pub(crate) point: usize,
+    /// What the actuator gets.
+    pub(crate) value: f64,
+    /// What the loop asked for, where a force replaced it.
+    pub(crate) asked: Option<f64>,
+}
+
+impl Put {
+    /// A value as it was asked for.
+    pub(crate) const fn plain(point: usize, value: f64) -> Self {
+        Self {
+            point,
+            value,
+            asked: None,
+        }
+    }
+}
+
 #[derive(Debug)]
 enum Bus {
     Sim(Box<SimDriver>),
@@ -91,6 +116,7 @@ pub struct IoServer {
     points: Vec<PointInfo>,
     places: Vec<Place>,
     indices: HashMap<PointId, PointIndex>,
+    forces: Forces,
     clock: Clock,
     /// Writers hold it for reading while they check and hand over, so that nothing is written behind `close`'s back.
     open: RwLock<bool>,
@@ -115,6 +141,7 @@ impl IoServer {
             points: Vec::new(),
             places: Vec::new(),
             indices: HashMap::new(),
+            forces: Forces::default(),
             clock,
             open: RwLock::new(true),
         };
@@ -214,10 +241,158 @@ impl IoServer {
         let Some((bus, point)) = self.place(index) else {
             return Reading::unconnected();
         };
-        match bus {
+        let reading = match bus {
             Bus::Sim(sim) => sim.read(point, now_ns),
             Bus::Modbus(modbus) => modbus.read(point, now_ns),
+        };
+        match self.forces.value(index, now_ns) {
+            None => reading,
+            // What an actuator holds is for its device to say; that a person put it there is for us.
+            Some(_) if self.info(index).is_some_and(|info| info.writable) => match reading.quality {
+                Quality::Good => Reading {
+                    quality: Quality::Forced,
+                    ..reading
+                },
+                _ => reading,
+            },
+            Some(value) => Reading {
+                quality: Quality::Forced,
+                ..Reading::good(value, now_ns)
+            },
         }
+    }
+
+    /// Holds a point at a value until `until_ns`: an input reads it, with the quality "forced"; an output's actuator gets it,
+    /// now and with every commit, whatever is committed. Again for the same point: the new value and time count.
+    ///
+    /// # Errors
+    /// [`Error::UnknownPoint`], [`Error::NotFinite`], [`Error::OutOfRange`], [`Error::ForceTime`],
+    /// [`Error::TooManyForces`], [`Error::Closed`].
+    pub fn force(&self, index: PointIndex, force: Force, now_ns: u64) -> Result<(), Error> {
+        let info = self.info(index).ok_or(Error::UnknownPoint(index.0))?;
+        Self::check_range(info, force.value)?;
+        let lasts_ns = force.until_ns.saturating_sub(now_ns);
+        if lasts_ns == 0 || lasts_ns > FORCE_NS_MAX {
+            return Err(Error::ForceTime {
+                point: info.id.clone(),
+                seconds: lasts_ns / 1_000_000_000,
+            });
+        }
+        let open = self.open.read();
+        if !*open {
+            return Err(Error::Closed);
+        }
+        self.forces.put(index, force)?;
+        if info.writable
+            && let Some((bus, point)) = self.place(index)
+            && let Ok(loop_id) = LoopId::new("forced")
+        {
+            let stamp = WriteStamp {
+                loop_id,
+                term: 0,
+                seq: 0,
+            };
+            Self::hand_over(bus, std::iter::once(Put::plain(point, force.value)), &stamp, now_ns);
+        }
+        Ok(())
+    }
+
+    /// Ends a force; says which there was. An output stays where it is until somebody writes it.
+    pub fn unforce(&self, index: PointIndex) -> Option<Force> {
+        self.forces.end(index)
+    }
+
+    /// All forces, those too whose time is over and that nobody has ended yet.
+    #[must_use]
+    pub fn forced(&self) -> Vec<(PointIndex, Force)> {
+        self.forces.all()
+    }
+
+    /// Hands forced outputs to their devices again: one that was away may hold something else. Unchanged values that a
+    /// device is known to hold are not sent. Simulated buses forget nothing.
+    pub fn hold_forced(&self, now_ns: u64) {
+        let open = self.open.read();
+        if !*open {
+            return;
+        }
+        for (index, force) in self.forces.all() {
+            if now_ns < force.until_ns
+                && self.info(index).is_some_and(|info| info.writable)
+                && let Some((Bus::Modbus(modbus), point)) = self.place(index)
+            {
+                modbus.write(std::iter::once((point, force.value)), now_ns);
+            }
+        }
+    }
+
+    /// Asks a device for something beside the polls. The queue is bounded and a full one refuses; nothing is sent once
+    /// `until` is over.
+    ///
+    /// # Errors
+    /// [`Error::NoSuchBus`], [`Error::NoRegisters`], [`Error::ErrandsFull`], [`Error::Config`] for what the protocol does not
+    /// know, [`Error::Closed`].
+    pub fn errand(&self, bus: &BusId, errand: Errand, until: std::time::Instant) -> Result<Asked, Error> {
+        errand::check(&errand)?;
+        if !*self.open.read() {
+            return Err(Error::Closed);
+        }
+        self.modbus(bus)?.errand(errand, until)
+    }
+
+    /// The named jobs of a bus, and the unit that their steps mean where they name none.
+    ///
+    /// # Errors
+    /// [`Error::NoSuchBus`], [`Error::NoRegisters`].
+    pub fn jobs(&self, bus: &BusId) -> Result<(&[JobConfig], u8), Error> {
+        let plan = self.modbus(bus)?.plan();
+        Ok((&plan.jobs, plan.unit_id))
+    }
+
+    /// The writable points that share an address with an errand that writes; none for one that reads.
+    ///
+    /// # Errors
+    /// [`Error::NoSuchBus`], [`Error::NoRegisters`].
+    pub fn touched(&self, bus: &BusId, errand: &Errand) -> Result<Vec<PointId>, Error> {
+        let plan = self.modbus(bus)?.plan();
+        let Errand::Write {
+            unit_id,
+            table,
+            start,
+            words,
+        } = errand
+        else {
+            return Ok(Vec::new());
+        };
+        let (start, end) = (usize::from(*start), usize::from(*start) + words.len());
+        let touches = |point: &&PlannedPoint| {
+            let length = if table.is_bits() {
+                1
+            } else {
+                usize::from(point.value_type.words())
+            };
+            let first = usize::from(point.address);
+            point.writable
+                && (point.unit_id, point.table) == (*unit_id, *table)
+                && first < end
+                && start < first + length
+        };
+        Ok(plan
+            .points
+            .iter()
+            .filter(touches)
+            .map(|point| point.id.clone())
+            .collect())
+    }
+
+    fn modbus(&self, bus: &BusId) -> Result<&ModbusDriver, Error> {
+        self.buses
+            .iter()
+            .find_map(|one| match one {
+                Bus::Sim(sim) if sim.status().bus == *bus => Some(Err(Error::NoRegisters(bus.clone()))),
+                Bus::Modbus(modbus) if modbus.plan().bus == *bus => Some(Ok(modbus)),
+                _ => None,
+            })
+            .unwrap_or_else(|| Err(Error::NoSuchBus(bus.to_string())))
     }
 
     /// Hands writes to their drivers, all of them or none: each value must be finite, its point writable and the value
@@ -252,14 +427,29 @@ impl IoServer {
             let local = writes
                 .iter()
                 .filter(|(other, _)| on_this_bus(other))
-                .filter_map(|(other, value)| self.places.get(other.position()).map(|p| (p.point as usize, *value)));
-            match self.buses.get(place.bus as usize) {
-                Some(Bus::Sim(sim)) => sim.write(local, stamp, now_ns),
-                Some(Bus::Modbus(modbus)) => modbus.write(local, now_ns),
-                None => {}
+                .filter_map(|(other, asked)| {
+                    let point = self.places.get(other.position())?.point as usize;
+                    Some(match self.forces.value(*other, now_ns) {
+                        Some(value) => Put {
+                            point,
+                            value,
+                            asked: Some(*asked),
+                        },
+                        None => Put::plain(point, *asked),
+                    })
+                });
+            if let Some(bus) = self.buses.get(place.bus as usize) {
+                Self::hand_over(bus, local, stamp, now_ns);
             }
         }
         Ok(())
+    }
+
+    fn hand_over(bus: &Bus, puts: impl Iterator<Item = Put>, stamp: &WriteStamp, now_ns: u64) {
+        match bus {
+            Bus::Sim(sim) => sim.write(puts, stamp, now_ns),
+            Bus::Modbus(modbus) => modbus.write(puts.map(|put| (put.point, put.value)), now_ns),
+        }
     }
 
     fn check(&self, index: PointIndex, value: f64) -> Result<(), Error> {
@@ -267,6 +457,10 @@ impl IoServer {
         if !info.writable {
             return Err(Error::NotWritable(info.id.clone()));
         }
+        Self::check_range(info, value)
+    }
+
+    fn check_range(info: &PointInfo, value: f64) -> Result<(), Error> {
         if !value.is_finite() {
             return Err(Error::NotFinite {
                 point: info.id.clone(),

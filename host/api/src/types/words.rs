@@ -93,6 +93,8 @@ words! {
         Uncertain,
         /// Usable.
         Good,
+        /// Usable; a person put it there in the place of the instrument's or the loop's own.
+        Forced,
     }
 }
 
@@ -164,6 +166,7 @@ impl Quality {
             Self::Bad => "bad",
             Self::Uncertain => "uncertain",
             Self::Good => "good",
+            Self::Forced => "forced",
         }
     }
 }

@@ -16,7 +16,13 @@ use super::{
     link::Link,
     outbox::{Outbox, Wish, encoded},
 };
-use crate::{BusStatus, Clock, image::Image, limits::CLOSE_WAIT_MS, status::StatusCell};
+use crate::{
+    BusStatus, Clock, Errand, Error,
+    errand::{Asked, Post},
+    image::Image,
+    limits::CLOSE_WAIT_MS,
+    status::StatusCell,
+};
 
 /// What the task and the server share.
 #[derive(Debug)]
@@ -33,6 +39,7 @@ pub(crate) struct Shared {
 pub(crate) struct ModbusDriver {
     shared: Arc<Shared>,
     stop: watch::Sender<bool>,
+    post: Post,
     /// Closes when the task has ended.
     ended: Mutex<mpsc::Receiver<()>>,
 }
@@ -55,7 +62,8 @@ impl ModbusDriver {
         });
         let (stop, stopped) = watch::channel(false);
         let (ending, ended) = mpsc::channel();
-        let link = Link::new(shared.clone(), stopped);
+        let (post, errands) = Post::new();
+        let link = Link::new(shared.clone(), stopped, errands);
         runtime.spawn(async move {
             // Dropped with the task, however it ends.
             let _ending: mpsc::Sender<()> = ending;
@@ -64,6 +72,7 @@ impl ModbusDriver {
         Self {
             shared,
             stop,
+            post,
             ended: Mutex::new(ended),
         }
     }
@@ -83,6 +92,16 @@ impl ModbusDriver {
                 });
             }
         }
+    }
+
+    /// Puts an errand into the bus's queue.
+    pub(crate) fn errand(&self, errand: Errand, until: std::time::Instant) -> Result<Asked, Error> {
+        self.post.send(&self.shared.plan.bus, errand, until)
+    }
+
+    /// What the bus was planned with.
+    pub(crate) fn plan(&self) -> &Plan {
+        &self.shared.plan
     }
 
     pub(crate) fn status(&self) -> BusStatus {

@@ -16,7 +16,7 @@ use std::{borrow::Cow, collections::HashMap, sync::Arc, time::Duration};
 use bumpless_core::{NoData, Quality};
 use tokio::{
     net::TcpStream,
-    sync::watch,
+    sync::{mpsc, watch},
     time::{Instant, timeout},
 };
 use tokio_modbus::{
@@ -35,6 +35,7 @@ use super::{
 };
 use crate::{
     config::OnStop,
+    errand::{Errand, ErrandError, Posted},
     limits::{BITS_PER_WRITE_MAX, REGISTERS_PER_WRITE_MAX},
 };
 
@@ -73,13 +74,14 @@ struct Quiet {
 pub(crate) struct Link {
     shared: Arc<Shared>,
     stop: watch::Receiver<bool>,
+    errands: mpsc::Receiver<Posted>,
     polls: Vec<Poll>,
     backoff: Backoff,
     quiet: HashMap<u8, Quiet>,
 }
 
 impl Link {
-    pub(crate) fn new(shared: Arc<Shared>, stop: watch::Receiver<bool>) -> Self {
+    pub(crate) fn new(shared: Arc<Shared>, stop: watch::Receiver<bool>, errands: mpsc::Receiver<Posted>) -> Self {
         let now = Instant::now();
         let polls = shared
             .plan
@@ -95,6 +97,7 @@ impl Link {
         Self {
             shared,
             stop,
+            errands,
             polls,
             backoff,
             quiet: HashMap::new(),
@@ -169,17 +172,29 @@ impl Link {
             {
                 return end;
             }
+            // One between two polls, so that neither waits for the other for long.
+            if let Ok(posted) = self.errands.try_recv()
+                && let Err(end) = self.errand(context, posted).await
+            {
+                return end;
+            }
             let Some((number, due)) = self.next_poll() else {
                 // A plan has points, so there are groups; without any there is nothing to do but wait for the stop.
                 let _ = self.stop.wait_for(|stop| *stop).await;
                 continue;
             };
             if due > Instant::now() {
-                tokio::select! {
+                let posted = tokio::select! {
                     biased;
-                    _ = self.stop.wait_for(|stop| *stop) => {}
-                    () = self.shared.outbox.notify.notified() => {}
-                    () = tokio::time::sleep_until(due) => {}
+                    _ = self.stop.wait_for(|stop| *stop) => None,
+                    () = self.shared.outbox.notify.notified() => None,
+                    posted = self.errands.recv() => posted,
+                    () = tokio::time::sleep_until(due) => None,
+                };
+                if let Some(posted) = posted
+                    && let Err(end) = self.errand(context, posted).await
+                {
+                    return end;
                 }
                 continue;
             }
@@ -439,6 +454,78 @@ impl Link {
             ),
             request,
         ))
+    }
+
+    /// One errand. Its asker may be gone, or its time over: then nothing is sent.
+    async fn errand(&mut self, context: &mut Context, posted: Posted) -> Result<(), End> {
+        let Posted { errand, until, reply } = posted;
+        if reply.is_closed() || std::time::Instant::now() >= until {
+            let _ = reply.send(Err(ErrandError::NoTurn));
+            return Ok(());
+        }
+        let (unit_id, request) = match &errand {
+            Errand::Read {
+                unit_id,
+                table,
+                start,
+                count,
+            } => (
+                *unit_id,
+                match table {
+                    Table::Coil => Request::ReadCoils(*start, *count),
+                    Table::Discrete => Request::ReadDiscreteInputs(*start, *count),
+                    Table::Holding => Request::ReadHoldingRegisters(*start, *count),
+                    Table::Input => Request::ReadInputRegisters(*start, *count),
+                },
+            ),
+            Errand::Write {
+                unit_id,
+                table,
+                start,
+                words,
+            } => (
+                *unit_id,
+                if table.is_bits() {
+                    Request::WriteMultipleCoils(*start, words.iter().map(|word| *word != 0).collect())
+                } else {
+                    Request::WriteMultipleRegisters(*start, Cow::Borrowed(words))
+                },
+            ),
+        };
+        let (answer, end) = match self.request(context, unit_id, request).await {
+            Ok(response) => {
+                self.answered(unit_id);
+                let words = match (&errand, response) {
+                    (Errand::Write { .. }, _) => Ok(Vec::new()),
+                    (Errand::Read { count, .. }, Response::ReadCoils(bits) | Response::ReadDiscreteInputs(bits)) => {
+                        Ok(bits.into_iter().take(usize::from(*count)).map(u16::from).collect())
+                    }
+                    (
+                        Errand::Read { count, .. },
+                        Response::ReadHoldingRegisters(words) | Response::ReadInputRegisters(words),
+                    ) if words.len() == usize::from(*count) => Ok(words),
+                    _ => Err(ErrandError::Lost(
+                        "the answer has another length than asked for".to_owned(),
+                    )),
+                };
+                (words, Ok(()))
+            }
+            Err(Failure::Exception(code)) => {
+                self.answered(unit_id);
+                let name = exception_name(code);
+                (Err(ErrandError::Exception { code, name }), Ok(()))
+            }
+            Err(failure) => {
+                let error = match &failure {
+                    Failure::Lost(problem) => ErrandError::Lost(problem.clone()),
+                    _ => ErrandError::NoAnswer(self.shared.plan.timeout_ms),
+                };
+                (Err(error), Err(self.lost(unit_id, &errand.place(), failure)))
+            }
+        };
+        // Nobody waits any more: that is the asker's matter.
+        let _ = reply.send(answer);
+        end
     }
 
     /// One request, within its time.

@@ -15,10 +15,10 @@ use super::{Command, Fopdt, Instrument, Plant, SimConfig, plant::STEP_NS};
 use crate::{
     Error,
     config::OnStop,
-    journal::{Journal, Line},
+    journal::{Journal, Line, LineEnd},
     limits::PLANT_CATCH_UP_MS_MAX,
     scaling::{Scaling, Signal},
-    server::{PointInfo, WriteStamp},
+    server::{PointInfo, Put, WriteStamp},
     status::{BusStatus, StatusCell},
 };
 
@@ -348,22 +348,22 @@ impl SimDriver {
     }
 
     /// Sets points that the server has checked, together, and writes them into the journal.
-    pub(crate) fn write(&self, writes: impl Iterator<Item = (usize, f64)>, stamp: &WriteStamp, now_ns: u64) {
+    pub(crate) fn write(&self, writes: impl Iterator<Item = Put>, stamp: &WriteStamp, now_ns: u64) {
         match &self.model {
             Model::Plant(course) => {
                 let mut course = course.lock();
                 course.advance(now_ns);
-                for (point, value) in writes {
+                for Put { point, value, asked } in writes {
                     match PLANT_POINTS.get(point).map(|row| row.1) {
                         Some(Role::Sets(command)) => course.plant.set_command(command, value),
                         Some(Role::Breaks(instrument)) => course.plant.set_broken(instrument, value > 0.5),
                         Some(Role::Measures(_) | Role::LowLevel) | None => continue,
                     }
-                    self.note(point, value, stamp, now_ns, None);
+                    self.note(point, value, stamp, now_ns, taken(asked));
                 }
             }
             Model::Fopdt(processes) => {
-                for (point, value) in writes {
+                for Put { point, value, asked } in writes {
                     let Some(process) = processes.get(point / FOPDT_POINTS) else {
                         continue;
                     };
@@ -372,7 +372,7 @@ impl SimDriver {
                         2 => process.lock().set_load(value, now_ns),
                         _ => continue,
                     }
-                    self.note(point, value, stamp, now_ns, None);
+                    self.note(point, value, stamp, now_ns, taken(asked));
                 }
             }
         }
@@ -383,12 +383,12 @@ impl SimDriver {
         if self.status.error(&reason.to_string()) {
             tracing::warn!(bus = %self.status.get().bus, loop_id = %stamp.loop_id, "{reason}");
         }
-        self.note(point, value, stamp, now_ns, Some(reason));
+        self.note(point, value, stamp, now_ns, LineEnd::Refused(reason.to_string()));
     }
 
     /// One line for the journal, if there is one.
-    fn note(&self, point: usize, value: f64, stamp: &WriteStamp, now_ns: u64, refused: Option<&Error>) {
-        if refused.is_none() {
+    fn note(&self, point: usize, value: f64, stamp: &WriteStamp, now_ns: u64, end: LineEnd) {
+        if !matches!(end, LineEnd::Refused(_)) {
             self.writes.fetch_add(1, Relaxed);
         }
         let (Some(journal), Some(id)) = (&self.journal, self.points.get(point)) else {
@@ -401,7 +401,7 @@ impl SimDriver {
             loop_id: stamp.loop_id.clone(),
             term: stamp.term,
             seq: stamp.seq,
-            refused: refused.map(ToString::to_string),
+            end,
         });
     }
 
@@ -426,11 +426,11 @@ impl SimDriver {
             match &self.model {
                 Model::Plant(_) => {
                     let outputs = PLANT_POINTS.iter().enumerate().filter(|(_, row)| row.2 == "V");
-                    self.write(outputs.map(|(point, _)| (point, 0.0)), &stamp, now_ns);
+                    self.write(outputs.map(|(point, _)| Put::plain(point, 0.0)), &stamp, now_ns);
                 }
                 Model::Fopdt(processes) => {
                     self.write(
-                        (0..processes.len()).map(|n| (n * FOPDT_POINTS + 1, 0.0)),
+                        (0..processes.len()).map(|n| Put::plain(n * FOPDT_POINTS + 1, 0.0)),
                         &stamp,
                         now_ns,
                     );
@@ -444,6 +444,11 @@ impl SimDriver {
 }
 
 /// An instrument's reading, from its current. The last good value is the true one: a sound transmitter would show it.
+/// The end of a write that the actuator got.
+fn taken(asked: Option<f64>) -> LineEnd {
+    asked.map_or(LineEnd::Taken, LineEnd::Forced)
+}
+
 fn measured(plant: &Plant, instrument: Instrument, low: f64, high: f64, at_ns: u64) -> Reading {
     let Some(scaling) = Scaling::range([4.0, 20.0], low, high, Signal::Current, false) else {
         return Reading::missing(NoData::OutOfRange, 0.0, at_ns);

@@ -8,7 +8,9 @@
     reason = "tests"
 )]
 
+mod errands;
 mod peer;
+mod scan;
 
 use std::{
     net::SocketAddr,
@@ -27,7 +29,7 @@ struct Bench {
     server: IoServer,
     peer: Peer,
     /// Ends after the server.
-    _runtime: Runtime,
+    runtime: Runtime,
 }
 
 fn runtime() -> Runtime {
@@ -58,7 +60,7 @@ impl Bench {
         Self {
             server: open(&runtime, peer.address, bus, points),
             peer,
-            _runtime: runtime,
+            runtime,
         }
     }
 
@@ -76,7 +78,7 @@ impl Bench {
         Self {
             server,
             peer: reserved.listen(&runtime),
-            _runtime: runtime,
+            runtime,
         }
     }
 
