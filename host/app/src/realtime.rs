@@ -6,7 +6,13 @@
 //!                         tx-n, rx-n, net-n, acc-n, app-n   the bus: what carries a cycle between hosts
 //!                    10   record-writer, cycle-writer, io-journal, loops-reaper: they take what a cycle leaves
 //! usual class, nice −10   all others: API, deployment, field buses, disk
+//!
+//!   raised ──(the watch sleeps 50 ms and wakes up a quarter of a second late: the host was held up)──► usual class
+//!     ▲                                                                                                    │
+//!     └───────────────────────────────(a quarter of a second to catch up)──────────────────────────────────┘
 //! ```
+//! A host that stood still finds seconds of messages before it. While it works them off, it goes behind others: with its
+//! real-time priority it would hold up the hosts beside it for tens of milliseconds, for cycles that are long over.
 //! Loops and bus have one priority: they share locks, and a thread that finds one taken yields to its equals alone. With
 //! loops above the bus a remote step took six times the processor time that it takes in the usual class. Whoever takes from a queue that a cycle fills is in
 //! the class too: a sender that meets a receiver in the middle of its work yields until it is done, and would never let a thread
@@ -19,7 +25,10 @@
 //! host runs as any other program and says so once. The kernel itself keeps a part of each second for the other classes
 //! (`/proc/sys/kernel/sched_rt_runtime_us`, 5 % unless it was changed).
 
-use std::io;
+use std::{
+    io,
+    time::{Duration, Instant},
+};
 
 use rustix::{process::setpriority_process, thread::Pid};
 use serde::{Deserialize, Serialize};
@@ -28,12 +37,23 @@ use crate::error::Error;
 
 /// Nice value of what is not the cycle's. The compiling child goes to 19 by itself.
 const NICE: i32 = -10;
+/// Real-time priority of the watch: it decides before the backlog of a host that was held up is touched.
+const WATCH: i32 = 30;
+/// Name of the watch's thread.
+const WATCH_NAME: &str = "bl-watch";
+/// The watch looks this often: twenty times a second is no load.
+const LOOK: Duration = Duration::from_millis(50);
+/// A watch that is this late means that the whole host stood still: stopped, or its machine was.
+const HELD_UP: Duration = Duration::from_millis(250);
+/// Time to work off what has come meanwhile: links hold about a megabyte each, which takes some tens of ms.
+const CATCH_UP: Duration = Duration::from_millis(250);
 /// Real-time priority of everything that a cycle crosses: in the lower half, below what a machine's own drivers use.
 const CYCLE: i32 = 20;
 /// Real-time priority of the threads that take what a cycle leaves: behind it, and before everything else.
 const TAKER: i32 = 10;
 /// Classes by the beginning of a thread's name. Source of the bus's names: zenoh-runtime, `ZRuntime`.
-const PRIORITIES: [(&str, i32); 11] = [
+const PRIORITIES: [(&str, i32); 12] = [
+    (WATCH_NAME, WATCH),
     ("bl-epoch", 30),
     // Before "loops-": it only drops memory.
     ("loops-reaper", TAKER),
@@ -70,16 +90,13 @@ pub fn raise(wish: Realtime) -> Result<(), Error> {
     if wish == Realtime::Off {
         return Ok(());
     }
-    let raised = threads().and_then(|threads| {
-        for (id, name) in threads {
-            gone_is_fine(setpriority_process(Some(id), NICE).map_err(io::Error::from))?;
-            let class = PRIORITIES.iter().find(|(prefix, _)| name.starts_with(prefix));
-            if let Some((_, priority @ 1..)) = class {
-                gone_is_fine(fifo(id, *priority))?;
-            }
-        }
-        Ok(())
-    });
+    let raised = raise_all();
+    if raised.is_ok() {
+        std::thread::Builder::new()
+            .name(WATCH_NAME.to_owned())
+            .spawn(watch)
+            .map_err(|error| Error::start("the real-time class", error.to_string()))?;
+    }
     match raised {
         Ok(()) => tracing::info!("the cycle's threads run in the real-time class"),
         Err(error) if wish == Realtime::Required => {
@@ -94,10 +111,57 @@ pub fn raise(wish: Realtime) -> Result<(), Error> {
     Ok(())
 }
 
+/// Every thread of this process gets its class by its name.
+fn raise_all() -> io::Result<()> {
+    for (id, name) in threads()? {
+        gone_is_fine(setpriority_process(Some(id), NICE).map_err(io::Error::from))?;
+        let class = PRIORITIES.iter().find(|(prefix, _)| name.starts_with(prefix));
+        if let Some((_, priority)) = class {
+            gone_is_fine(schedule(id, libc::SCHED_FIFO, *priority))?;
+        }
+    }
+    Ok(())
+}
+
+/// Every thread but the watch itself goes back to the usual class; it keeps its nice value.
+fn lower_all() -> io::Result<()> {
+    for (id, name) in threads()? {
+        if name != WATCH_NAME {
+            gone_is_fine(schedule(id, libc::SCHED_OTHER, 0))?;
+        }
+    }
+    Ok(())
+}
+
+/// Watches for this host having been held up, for as long as the process lives.
+fn watch() {
+    // Threads that are made later do not inherit from this one, so it raises itself.
+    if let Err(error) = schedule(rustix::thread::gettid(), libc::SCHED_FIFO, WATCH) {
+        tracing::warn!(%error, "a host that was held up will work off its backlog before others");
+    }
+    loop {
+        let before = Instant::now();
+        std::thread::sleep(LOOK);
+        if before.elapsed() < LOOK + HELD_UP {
+            continue;
+        }
+        let lowered = lower_all();
+        std::thread::sleep(CATCH_UP);
+        let raised = raise_all();
+        match lowered.and(raised) {
+            Ok(()) => tracing::info!(
+                held_up_ms = before.elapsed().saturating_sub(LOOK + CATCH_UP).as_millis(),
+                "this host was held up; it worked off its backlog behind others"
+            ),
+            Err(error) => tracing::warn!(%error, "threads stay in the class that they have"),
+        }
+    }
+}
+
 /// Puts the calling thread where a host's cycles run: for measurements beside them. False where the system refuses it.
 #[must_use]
 pub fn raise_this_thread() -> bool {
-    fifo(rustix::thread::gettid(), CYCLE).is_ok()
+    schedule(rustix::thread::gettid(), libc::SCHED_FIFO, CYCLE).is_ok()
 }
 
 /// The threads of this process and their names.
@@ -121,7 +185,7 @@ fn gone_is_fine(result: io::Result<()>) -> io::Result<()> {
     }
 }
 
-fn fifo(thread: Pid, priority: i32) -> io::Result<()> {
+fn schedule(thread: Pid, policy: i32, priority: i32) -> io::Result<()> {
     let parameters = libc::sched_param {
         sched_priority: priority,
     };
@@ -131,8 +195,7 @@ fn fifo(thread: Pid, priority: i32) -> io::Result<()> {
         unsafe_code,
         reason = "a system call that no safe crate of the workspace has; see SAFETY"
     )]
-    let status =
-        unsafe { libc::sched_setscheduler(thread.as_raw_nonzero().get(), libc::SCHED_FIFO, &raw const parameters) };
+    let status = unsafe { libc::sched_setscheduler(thread.as_raw_nonzero().get(), policy, &raw const parameters) };
     if status == 0 {
         Ok(())
     } else {
@@ -183,6 +246,6 @@ mod tests {
     #[test]
     fn a_thread_that_is_gone_is_no_failure() {
         let nobody = Pid::from_raw(i32::MAX - 1).unwrap();
-        assert!(gone_is_fine(fifo(nobody, 20)).is_ok() || !raise_this_thread());
+        assert!(gone_is_fine(schedule(nobody, libc::SCHED_FIFO, 20)).is_ok() || !raise_this_thread());
     }
 }

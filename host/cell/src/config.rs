@@ -9,8 +9,8 @@ use zenoh::config::EndPoint;
 use crate::{
     error::{Error, cut},
     limits::{
-        CYCLE_BATCHES, ENDPOINTS_MAX, LEASE_MS_MAX, LEASE_MS_MIN, REPLY_WAIT_US_MAX, REQUEST_BYTES_MAX,
-        SEND_BUFFER_BYTES,
+        CYCLE_BATCHES, ENDPOINTS_MAX, LEASE_MS_MAX, LEASE_MS_MIN, RECEIVE_BUFFER_BYTES, REPLY_WAIT_US_MAX,
+        REQUEST_BYTES_MAX, SEND_BUFFER_BYTES,
     },
 };
 
@@ -148,6 +148,7 @@ impl Config {
                 REPLY_WAIT_US_MAX.to_string(),
             ),
             ("transport/link/tcp/so_sndbuf", SEND_BUFFER_BYTES.to_string()),
+            ("transport/link/tcp/so_rcvbuf", RECEIVE_BUFFER_BYTES.to_string()),
             // The largest reply and its frame.
             (
                 "transport/link/rx/max_message_size",

@@ -51,6 +51,10 @@ pub const CYCLE_BATCHES: usize = 16;
 /// Bytes of the kernel's send buffer for each link. What lies in it is ahead of every cycle message whatever its
 /// priority; 256 KiB is 2 ms at 1 Gbit/s, and still more than one round trip of a plant network holds.
 pub const SEND_BUFFER_BYTES: u32 = 256 * 1024;
+/// Kernel's receive buffer of one link, in bytes. Left to the kernel it grows to tens of megabytes while a host is held up, and
+/// the host then works off seconds of messages, at the priority of cycles, before it comes to the present. With this bound the
+/// sender's lane fills instead, and drops what nobody will need. A component's transfer still moves this much per round trip.
+pub const RECEIVE_BUFFER_BYTES: u32 = 128 * 1024;
 
 /// Time in µs that a reply waits for the link before Zenoh gives the link up.
 pub const REPLY_WAIT_US_MAX: u64 = 5_000_000;
