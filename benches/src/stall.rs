@@ -1,8 +1,9 @@
 //! What the machine itself stalled: one bare thread per core that only sleeps to absolute deadlines.
 //!
-//! Owns: the threads, and the list of times at which they woke more than 1 ms late. They run beside a bench, in the same
-//! class as the threads of the hosts' cycles, so what holds them up holds any thread up: another machine on the same hardware,
-//! another program. Never: makes a gap or a lost cycle disappear; it says how much of it the machine took.
+//! Owns: the threads, and the list of times at which they woke more than 1 ms late (beside a fast loop: a quarter of its
+//! period). They run beside a bench, in the same class as the threads of the hosts' cycles, so what holds them up holds any
+//! thread up: another machine on the same hardware, another program. Never: makes a gap or a lost cycle disappear; it says how
+//! much of it the machine took.
 //!
 //! Times are ns since 1970 on a steady clock, as in an I/O host's journal.
 
@@ -23,10 +24,12 @@ use rustix::{
 
 use crate::{report::Report, spread::Spread};
 
-/// Time between two deadlines, in ns.
-const PERIOD_NS: u64 = 1_000_000;
-/// A wake-up later than this is a stall, in ns.
-const STALL_NS_MIN: u64 = 1_000_000;
+/// Longest time between two deadlines, in ns. A wake-up later than that is a stall.
+const PERIOD_NS_MAX: u64 = 1_000_000;
+/// Deadlines per period of the loop that is measured: a stall that hides between two of them is a quarter of a cycle at most.
+const LOOKS_PER_CYCLE: u64 = 4;
+/// Shortest time between two deadlines, in ns: more would be a load of its own.
+const PERIOD_NS_MIN: u64 = 200_000;
 /// Stalls kept per core. A machine that stalls more often than this is no machine to measure on.
 const STALLS_MAX: usize = 1_000_000;
 
@@ -99,6 +102,12 @@ impl Ticks {
 impl Watch {
     /// Starts one thread per core that this process may use.
     pub(crate) fn start() -> Self {
+        Self::beside(u64::MAX)
+    }
+
+    /// The same, fine enough for a loop of this period, in ns.
+    pub(crate) fn beside(cycle_ns: u64) -> Self {
+        let period_ns = (cycle_ns / LOOKS_PER_CYCLE).clamp(PERIOD_NS_MIN, PERIOD_NS_MAX);
         let stop = Arc::new(AtomicBool::new(false));
         let allowed = sched_getaffinity(None).ok();
         let cores: Vec<usize> = allowed
@@ -110,7 +119,7 @@ impl Watch {
             .filter_map(|core| {
                 let stop = Arc::clone(&stop);
                 let thread = std::thread::Builder::new().name(format!("stall-{core}"));
-                thread.spawn(move || watch(core, clock, &stop)).ok()
+                thread.spawn(move || watch(core, clock, period_ns, &stop)).ok()
             })
             .collect();
         Self {
@@ -156,7 +165,7 @@ fn timespec(ns: u64) -> Timespec {
     }
 }
 
-fn watch(core: usize, clock: Clock, stop: &AtomicBool) -> (Vec<Stall>, Spread) {
+fn watch(core: usize, clock: Clock, period_ns: u64, stop: &AtomicBool) -> (Vec<Stall>, Spread) {
     let mut only = CpuSet::new();
     only.set(core);
     // Refusals only cost precision; a host that may not raise its threads runs at the usual priority too.
@@ -165,7 +174,7 @@ fn watch(core: usize, clock: Clock, stop: &AtomicBool) -> (Vec<Stall>, Spread) {
     let _ = rustix::thread::set_current_timer_slack(std::num::NonZeroU64::new(1));
     let (mut stalls, mut lateness) = (Vec::new(), Spread::new());
     let unix_minus_monotonic_ns = clock.now_ns().saturating_sub(monotonic_ns());
-    let mut deadline_ns = monotonic_ns() + PERIOD_NS;
+    let mut deadline_ns = monotonic_ns() + period_ns;
     loop {
         if clock_nanosleep_absolute(SleepClock::Monotonic, &timespec(deadline_ns)).is_err() {
             // A signal; the same deadline again.
@@ -174,14 +183,14 @@ fn watch(core: usize, clock: Clock, stop: &AtomicBool) -> (Vec<Stall>, Spread) {
         let now_ns = monotonic_ns();
         let late_ns = now_ns.saturating_sub(deadline_ns);
         lateness.add(late_ns);
-        if late_ns > STALL_NS_MIN && stalls.len() < STALLS_MAX {
+        if late_ns > period_ns && stalls.len() < STALLS_MAX {
             stalls.push(Stall {
                 from_ns: deadline_ns + unix_minus_monotonic_ns,
                 to_ns: now_ns + unix_minus_monotonic_ns,
             });
         }
         // Deadlines that passed meanwhile are part of the same stall.
-        deadline_ns += PERIOD_NS * (late_ns / PERIOD_NS + 1);
+        deadline_ns += period_ns * (late_ns / period_ns + 1);
         if stop.load(Ordering::Relaxed) {
             return (stalls, lateness);
         }

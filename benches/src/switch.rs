@@ -194,7 +194,7 @@ pub(crate) fn run(options: Options, switching: Switching, report: &mut Report) -
     let tuning = BTreeMap::from([("k", 1.5), ("ti", 1.0), ("td", 0.05)]);
     api.apply(&switching.draft(&pid, &tuning, None))?;
     let history = Arc::new(History::follow(&api, &[LOOP])?);
-    let watch = Watch::start();
+    let watch = Watch::beside(switching.period_ns());
     let clock = Clock::start();
     if !switching.is_shared() {
         api.move_owner(LOOP, "plant")?;
