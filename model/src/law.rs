@@ -70,6 +70,7 @@ pub(crate) fn law(revision: u64) -> Law {
         )]),
         listens: Vec::new(),
         fallback: None,
+        fallback_parameters: Default::default(),
         policy: Policy::default(),
     };
     let wiring = Wiring::new(&spec, &descriptor).expect("the law fits its loop");

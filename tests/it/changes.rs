@@ -135,7 +135,15 @@ fn a_component_that_keeps_failing_gives_way_to_the_loops_fallback() {
         refusal.contains("cannot be the fallback") && refusal.contains("inner-pv"),
         "{refusal}"
     );
+    wrong["fallback"] = json!("pid");
+    wrong["fallback_parameters"] = json!({ "gain": 0.7 });
+    let refusal = api.apply(&wrong).unwrap_err().to_string();
+    assert!(
+        refusal.contains("cannot be the fallback") && refusal.contains("gain"),
+        "{refusal}"
+    );
     draft["fallback"] = json!("pid");
+    draft["fallback_parameters"] = json!({ "k": 0.7 });
     let failing = whole(&api.apply(&draft).unwrap()["revision"]);
     let held = feed
         .record_where("faults", |r| {
@@ -154,6 +162,7 @@ fn a_component_that_keeps_failing_gives_way_to_the_loops_fallback() {
         text(&view["component"]).starts_with("pid@")
     })
     .unwrap();
+    assert_eq!(api.loop_view(LOOP).unwrap()["spec"]["parameters"]["k"], 0.7);
     feed.record_where("good cycles again", |r| {
         whole(&r["revision"]) > failing && event(r, "faulted").is_none() && event(r, "revised").is_none()
     })

@@ -229,6 +229,7 @@ pub(crate) fn test_spec() -> LoopSpec {
         limits: std::collections::BTreeMap::new(),
         listens: Vec::new(),
         fallback: None,
+        fallback_parameters: std::collections::BTreeMap::new(),
         policy: Policy::default(),
     }
 }

@@ -216,6 +216,8 @@ pub struct LoopSpec {
     /// The component that takes over, without a person, when this one has failed more often in a row than the policy
     /// tolerates; none where the policy alone decides.
     pub fallback: Option<Digest>,
+    /// Parameters of the fallback, by name; what is not named it takes from the loop's, or from its own defaults.
+    pub fallback_parameters: BTreeMap<String, f64>,
     /// The bounds within which the host runs the loop.
     pub policy: Policy,
 }

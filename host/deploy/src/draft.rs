@@ -58,6 +58,9 @@ pub struct LoopDraft {
     /// The component that takes over by itself when this one keeps failing; same forms as `component`.
     #[serde(default)]
     pub fallback: Option<String>,
+    /// Its parameters, by name; what is not named it takes from `parameters`, or from its own defaults.
+    #[serde(default)]
+    pub fallback_parameters: BTreeMap<String, f64>,
     /// Fault, hedge, takeover and swap policy.
     #[serde(default)]
     pub policy: Policy,

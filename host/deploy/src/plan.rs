@@ -87,6 +87,7 @@ pub(crate) fn spec(
         limits: draft.limits.clone(),
         listens: draft.listens.clone(),
         fallback: fallback_digest(draft)?,
+        fallback_parameters: draft.fallback_parameters.clone(),
         policy: draft.policy,
     };
     complete(spec, descriptor, ground)
@@ -94,6 +95,12 @@ pub(crate) fn spec(
 
 /// The fallback in a draft that reached the loop's home: its digest by then.
 fn fallback_digest(draft: &LoopDraft) -> Result<Option<Digest>, Error> {
+    if draft.fallback.is_none() && !draft.fallback_parameters.is_empty() {
+        return Err(Error::invalid(
+            "fallback_parameters are given, and no fallback",
+            "name a fallback, or leave its parameters out",
+        ));
+    }
     let parse = |text: &String| {
         text.parse().map_err(|_| {
             Error::invalid(
@@ -110,6 +117,8 @@ fn fallback_digest(draft: &LoopDraft) -> Result<Option<Digest>, Error> {
 pub(crate) fn fall_back(current: &LoopSpec, digest: Digest, old: Option<&Descriptor>, new: &Descriptor) -> Swapped {
     let mut swapped = swap(current, digest, old, new);
     swapped.spec.fallback = None;
+    let own = std::mem::take(&mut swapped.spec.fallback_parameters);
+    swapped.spec.parameters.extend(own);
     swapped.spec.policy.on_bump = OnBump::Alarm;
     swapped.spec.policy.probation_cycles = 0;
     swapped

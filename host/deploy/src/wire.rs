@@ -290,6 +290,7 @@ mod tests {
             )]),
             listens: vec![],
             fallback: None,
+            fallback_parameters: BTreeMap::from([("k".into(), 0.5)]),
             policy: Policy::default(),
         };
         for ask in [Ask::Apply(Box::new(draft)), Ask::Library, Ask::Points(7)] {

@@ -230,6 +230,7 @@ pub(crate) fn view(name: &str) -> LoopView {
             limits: Default::default(),
             listens: Vec::new(),
             fallback: None,
+            fallback_parameters: Default::default(),
             policy: Policy::default(),
         },
         pending: None,

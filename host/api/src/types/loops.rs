@@ -60,6 +60,9 @@ pub struct LoopDraft {
     /// same forms as `component`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub fallback: Option<String>,
+    /// Its parameters, by name; what is not named it takes from `parameters`, or from its own defaults.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub fallback_parameters: BTreeMap<String, f64>,
     /// Fault, hedge, takeover and swap policy.
     #[serde(default)]
     pub policy: Policy,
@@ -190,6 +193,7 @@ impl From<LoopDraft> for deploy::LoopDraft {
                 .collect(),
             listens: draft.listens,
             fallback: draft.fallback,
+            fallback_parameters: draft.fallback_parameters,
             policy: draft.policy.into(),
         }
     }
@@ -368,6 +372,7 @@ fn draft(spec: &model::LoopSpec, component: &str) -> LoopDraft {
             .collect(),
         listens: spec.listens.clone(),
         fallback: spec.fallback.map(|digest| digest.to_string()),
+        fallback_parameters: spec.fallback_parameters.clone(),
         policy: spec.policy.into(),
     }
 }

@@ -33,6 +33,7 @@ pub(super) fn spec() -> LoopSpec {
         limits: BTreeMap::new(),
         listens: vec![],
         fallback: None,
+        fallback_parameters: BTreeMap::new(),
         policy: Policy::default(),
     }
 }

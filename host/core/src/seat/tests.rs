@@ -59,6 +59,7 @@ fn setup() -> (LoopSpec, Wiring) {
         limits: [("out".to_owned(), limit)].into(),
         listens: vec![],
         fallback: None,
+        fallback_parameters: BTreeMap::new(),
         policy: Policy::default(),
     };
     let wiring = Wiring::new(&spec, &descriptor).unwrap();

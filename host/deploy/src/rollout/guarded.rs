@@ -92,6 +92,7 @@ mod tests {
             limits: BTreeMap::new(),
             listens: Vec::new(),
             fallback: None,
+            fallback_parameters: BTreeMap::new(),
             policy: Policy::default(),
         }
     }

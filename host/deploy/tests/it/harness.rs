@@ -246,6 +246,7 @@ pub(crate) fn draft(name: &str, component: &str, io: &str, number: u32) -> LoopD
         limits: BTreeMap::new(),
         listens: Vec::new(),
         fallback: None,
+        fallback_parameters: BTreeMap::new(),
         policy: Policy::default(),
     }
 }

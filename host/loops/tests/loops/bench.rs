@@ -228,6 +228,7 @@ impl Bench {
             .into(),
             listens: vec![],
             fallback: None,
+            fallback_parameters: BTreeMap::new(),
             policy: Policy {
                 probation_cycles: 30,
                 ..Policy::default()

@@ -41,6 +41,7 @@ pub(crate) fn spec(name: &str, setpoint: f64) -> LoopSpec {
         limits: BTreeMap::from([("output".into(), free), ("valve".into(), slow)]),
         listens: vec!["alarms".into()],
         fallback: None,
+        fallback_parameters: BTreeMap::new(),
         policy: Policy::default(),
     }
 }
