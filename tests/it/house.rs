@@ -69,7 +69,7 @@ const CONFINED: [(&str, &[&str]); 11] = [
     ("axum", &["bumpless-api"]),
     ("utoipa", &["bumpless-api"]),
     ("prometheus-client", &["bumpless-api"]),
-    ("tokio-modbus", &["bumpless-io"]),
+    ("tokio-rustls", &["bumpless-io"]),
     ("redb", &["bumpless-store"]),
     ("ratatui", &["bumpless-app"]),
     (

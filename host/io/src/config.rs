@@ -44,6 +44,8 @@ pub enum BusConfig {
     Sim(SimConfig),
     /// A Modbus TCP device, or several behind one address.
     ModbusTcp(Box<ModbusConfig>),
+    /// Modbus devices on a serial line.
+    ModbusRtu(Box<ModbusConfig>),
 }
 
 impl BusConfig {
@@ -52,7 +54,7 @@ impl BusConfig {
     pub const fn id(&self) -> &BusId {
         match self {
             Self::Sim(sim) => &sim.id,
-            Self::ModbusTcp(modbus) => &modbus.id,
+            Self::ModbusTcp(modbus) | Self::ModbusRtu(modbus) => &modbus.id,
         }
     }
 }

@@ -41,6 +41,14 @@ pub enum Errand {
 }
 
 impl Errand {
+    /// The unit that it is for.
+    #[must_use]
+    pub const fn unit_id(&self) -> u8 {
+        match self {
+            Self::Read { unit_id, .. } | Self::Write { unit_id, .. } => *unit_id,
+        }
+    }
+
     /// What it is about, in words.
     #[must_use]
     pub fn place(&self) -> String {

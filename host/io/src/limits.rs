@@ -62,6 +62,27 @@ pub const BITS_PER_READ_MAX: u16 = 2000;
 /// Registers of one write (6.12).
 pub const REGISTERS_PER_WRITE_MAX: u16 = 123;
 
+/// Registers that one request writes while it reads others (6.17).
+pub const REGISTERS_PER_READ_WRITE_MAX: u16 = 121;
+
+/// Connections of one Modbus bus: gateways bear few, and each is a task.
+pub const CONNECTIONS_PER_BUS_MAX: u8 = 8;
+
+/// Repetitions of a request that was not answered: more would only hide a line that is broken.
+pub const RETRIES_MAX: u8 = 5;
+
+/// Bits per second of a serial line.
+pub const BAUD_RANGE: (u32, u32) = (300, 4_000_000);
+
+/// Requests in a row that were not answered, after which a connection is made anew: the device may have forgotten it.
+pub const SILENT_IN_ROW_MAX: u32 = 3;
+
+/// Longest time that a client of a Modbus server may take to read an answer, in ms.
+pub const SERVER_SEND_MS_MAX: u64 = 10_000;
+
+/// Longest time that requests under way have when a Modbus server stops, in ms.
+pub const SERVER_STOP_MS_MAX: u64 = 3_000;
+
 /// Coils of one write (6.11).
 pub const BITS_PER_WRITE_MAX: u16 = 1968;
 

@@ -33,7 +33,7 @@ pub struct MappedRequest {
 /// # Errors
 /// [`Error::Config`] as the host would refuse it.
 pub fn requests(config: &ModbusConfig) -> Result<Vec<MappedRequest>, Error> {
-    let (plan, _) = config.plan()?;
+    let (plan, _) = config.plan(config.transport())?;
     let name = |point: usize| {
         plan.points
             .get(point)

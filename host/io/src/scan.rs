@@ -6,22 +6,20 @@
 //! ```
 //!
 //! Polite: a connection of its own, one request at a time, a pause between two, and a bound on all of them. Only reads.
-//! Never: takes a late answer for the next one's; after a silence the connection is made anew.
+//! Never: takes a late answer for the next one's, for answers carry the number of their request.
 
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 use tokio::{net::TcpStream, time::timeout};
-use tokio_modbus::{
-    ExceptionCode, Request, Response, Slave,
-    client::{Client as _, Context, tcp},
-    slave::SlaveContext as _,
-};
 
 use crate::{
     Error,
     limits::{SCAN_REQUESTS_MAX, SCAN_UNITS_MAX, TIMEOUT_MS_RANGE},
-    modbus::Table,
+    modbus::{
+        Exception, Framing, Request, Table,
+        connection::{Connection, Failure},
+    },
 };
 
 /// What to look at.
@@ -118,7 +116,7 @@ pub struct Scan {
 struct Scanner<'a> {
     address: &'a str,
     plan: &'a ScanPlan,
-    context: Option<Context>,
+    connection: Option<Connection>,
     scan: Scan,
 }
 
@@ -139,7 +137,7 @@ pub async fn scan(address: &str, plan: &ScanPlan) -> Result<Scan, Error> {
     let mut scanner = Scanner {
         address,
         plan,
-        context: None,
+        connection: None,
         scan: Scan::default(),
     };
     scanner.connect().await?;
@@ -173,7 +171,7 @@ impl Scanner<'_> {
             .map_err(|error| unreachable(error.to_string()))?;
         // Where the system refuses, requests leave a little later.
         let _ = stream.set_nodelay(true);
-        self.context = Some(tcp::attach(stream));
+        self.connection = Some(Connection::over_network(stream, Framing::Tcp));
         Ok(())
     }
 
@@ -188,32 +186,22 @@ impl Scanner<'_> {
         }
         self.scan.requests += 1;
         tokio::time::sleep(Duration::from_millis(self.plan.pause_ms)).await;
-        if self.context.is_none() {
+        if self.connection.is_none() {
             self.connect().await?;
         }
-        let Some(context) = &mut self.context else {
+        let Some(connection) = &mut self.connection else {
             return Ok(Some(Seen::Silent));
         };
-        context.set_slave(Slave(unit_id));
-        let request = match table {
-            Table::Coil => Request::ReadCoils(start, count),
-            Table::Discrete => Request::ReadDiscreteInputs(start, count),
-            Table::Holding => Request::ReadHoldingRegisters(start, count),
-            Table::Input => Request::ReadInputRegisters(start, count),
-        };
-        let answer = timeout(Duration::from_millis(self.plan.timeout_ms), context.call(request)).await;
-        Ok(Some(match answer {
-            Ok(Ok(Ok(Response::ReadHoldingRegisters(words) | Response::ReadInputRegisters(words))))
-                if words.len() == usize::from(count) =>
-            {
-                Seen::Readable
-            }
-            Ok(Ok(Ok(Response::ReadCoils(_) | Response::ReadDiscreteInputs(_)))) => Seen::Readable,
+        let request = Request::Read { table, start, count };
+        let longest = Duration::from_millis(self.plan.timeout_ms);
+        Ok(Some(match connection.call(unit_id, &request, longest).await {
+            Ok(_) => Seen::Readable,
             // A gateway says so of a unit that is not there.
-            Ok(Ok(Err(ExceptionCode::GatewayPathUnavailable | ExceptionCode::GatewayTargetDevice))) => Seen::Silent,
-            Ok(Ok(_)) => Seen::Refused,
-            Ok(Err(_)) | Err(_) => {
-                self.context = None;
+            Err(Failure::Exception(Exception::PATH | Exception::TARGET)) => Seen::Silent,
+            Err(Failure::Exception(_) | Failure::Malformed(_)) => Seen::Refused,
+            Err(Failure::Silent(_)) => Seen::Silent,
+            Err(Failure::Lost(_)) => {
+                self.connection = None;
                 Seen::Silent
             }
         }))

@@ -20,7 +20,7 @@ use crate::{
     force::{Force, Forces},
     job::JobConfig,
     limits::{BUSES_MAX, FORCE_NS_MAX, POINTS_MAX},
-    modbus::{Plan, PlannedPoint, driver::ModbusDriver},
+    modbus::{Plan, PlannedPoint, Transport, driver::ModbusDriver},
     sim::driver::SimDriver,
 };
 
@@ -158,7 +158,10 @@ impl IoServer {
                 BusConfig::Sim(sim) => SimDriver::open(sim, clock.now_ns())
                     .map(|(driver, infos)| (Prepared::Sim(Box::new(driver)), infos))?,
                 BusConfig::ModbusTcp(modbus) => modbus
-                    .plan()
+                    .plan(Transport::Tcp)
+                    .map(|(plan, infos)| (Prepared::Modbus(Box::new(plan)), infos))?,
+                BusConfig::ModbusRtu(modbus) => modbus
+                    .plan(Transport::Line)
                     .map(|(plan, infos)| (Prepared::Modbus(Box::new(plan)), infos))?,
             };
             prepared.push(bus);

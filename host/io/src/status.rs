@@ -13,12 +13,16 @@ use crate::limits::ERROR_CHARS_MAX;
 pub struct BusStatus {
     /// The bus.
     pub bus: BusId,
-    /// `sim` or `modbus-tcp`.
+    /// `sim`, `modbus-tcp` or `modbus-rtu`.
     pub driver: &'static str,
     /// Does the device answer? A simulated plant always does.
     pub connected: bool,
     /// Points that the bus owns.
     pub points: usize,
+    /// Requests that were sent, repetitions among them; 0 for a simulated plant.
+    pub requests: u64,
+    /// Requests that were sent again because they were not answered.
+    pub retries: u64,
     /// Read requests answered well (simulated plant: readings).
     pub polls: u64,
     /// Writes that the device took.
@@ -50,6 +54,8 @@ impl StatusCell {
             driver,
             connected,
             points,
+            requests: 0,
+            retries: 0,
             polls: 0,
             writes: 0,
             errors: 0,

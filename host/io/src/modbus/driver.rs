@@ -1,9 +1,13 @@
-//! A Modbus bus as the server sees it: an image to read, an outbox to write, a task that runs the connection.
+//! A Modbus bus as the server of points sees it: an image to read, an outbox to write, tasks that run the connections.
 //!
 //! Never: waits for the device.
 
 use std::{
-    sync::{Arc, mpsc},
+    sync::{
+        Arc,
+        atomic::{AtomicU32, Ordering},
+        mpsc,
+    },
     time::Duration,
 };
 
@@ -24,7 +28,7 @@ use crate::{
     status::StatusCell,
 };
 
-/// What the task and the server share.
+/// What the tasks and the server share.
 #[derive(Debug)]
 pub(crate) struct Shared {
     pub(crate) plan: Plan,
@@ -32,6 +36,24 @@ pub(crate) struct Shared {
     pub(crate) outbox: Outbox,
     pub(crate) status: StatusCell,
     pub(crate) clock: Clock,
+    /// One bit for each connection over which a unit answers.
+    answering: AtomicU32,
+}
+
+impl Shared {
+    /// A connection's units answer, or none of them does.
+    pub(crate) fn answers(&self, lane: usize, answers: bool) {
+        let bit = 1_u32 << lane.min(31);
+        let before = if answers {
+            self.answering.fetch_or(bit, Ordering::AcqRel)
+        } else {
+            self.answering.fetch_and(!bit, Ordering::AcqRel)
+        };
+        if (before & bit != 0) != answers {
+            let any = if answers { true } else { before & !bit != 0 };
+            self.status.update(|s| s.connected = any);
+        }
+    }
 }
 
 /// A Modbus bus at work.
@@ -39,40 +61,52 @@ pub(crate) struct Shared {
 pub(crate) struct ModbusDriver {
     shared: Arc<Shared>,
     stop: watch::Sender<bool>,
-    post: Post,
-    /// Closes when the task has ended.
+    /// The units, in order; the connection of one is its rank, round robin.
+    units: Vec<u8>,
+    /// The way of errands to each connection.
+    posts: Vec<Post>,
+    /// Closes when every task has ended.
     ended: Mutex<mpsc::Receiver<()>>,
 }
 
 impl ModbusDriver {
-    /// Starts the task.
+    /// Starts the tasks, one for each connection that has units.
     pub(crate) fn start(plan: Plan, clock: Clock, runtime: &tokio::runtime::Handle) -> Self {
         // The task says at once when the device is gone; this bound is for a task that cannot even do that.
-        let stale_ns = |period_ms: u64| (3 * period_ms + 2 * plan.timeout_ms).saturating_mul(1_000_000);
+        let tries = 2 * (1 + u64::from(plan.retries));
+        let stale_ns = |period_ms: u64| (3 * period_ms + tries * plan.timeout_ms).saturating_mul(1_000_000);
+        let units = plan.units();
+        let lane = |unit_id: u8| units.binary_search(&unit_id).unwrap_or(0) % plan.connections.max(1);
+        let lanes: Vec<u8> = plan.points.iter().map(|p| lane(p.unit_id) as u8).collect();
+        let count = units.len().min(plan.connections.max(1));
         let shared = Arc::new(Shared {
             image: Image::new(plan.points.iter().map(|p| stale_ns(p.period_ms))),
-            outbox: Outbox::new(
-                plan.points.len(),
-                ms_to_ns(plan.write_repeat_ms),
-                ms_to_ns(plan.write_expiry_ms),
-            ),
-            status: StatusCell::new(plan.bus.clone(), "modbus-tcp", false, plan.points.len()),
+            outbox: Outbox::new(lanes, ms_to_ns(plan.write_repeat_ms), ms_to_ns(plan.write_expiry_ms)),
+            status: StatusCell::new(plan.bus.clone(), plan.way.driver(), false, plan.points.len()),
             clock,
+            answering: AtomicU32::new(0),
             plan,
         });
         let (stop, stopped) = watch::channel(false);
         let (ending, ended) = mpsc::channel();
-        let (post, errands) = Post::new();
-        let link = Link::new(shared.clone(), stopped, errands);
-        runtime.spawn(async move {
-            // Dropped with the task, however it ends.
-            let _ending: mpsc::Sender<()> = ending;
-            link.run().await;
-        });
+        let mut posts = Vec::with_capacity(count);
+        for number in 0..count {
+            let (post, errands) = Post::new();
+            posts.push(post);
+            let own = units.iter().copied().skip(number).step_by(count).collect();
+            let link = Link::new(Arc::clone(&shared), number, own, stopped.clone(), errands);
+            let ending: mpsc::Sender<()> = ending.clone();
+            runtime.spawn(async move {
+                // Dropped with the task, however it ends.
+                let _ending = ending;
+                link.run().await;
+            });
+        }
         Self {
             shared,
             stop,
-            post,
+            units,
+            posts,
             ended: Mutex::new(ended),
         }
     }
@@ -81,7 +115,7 @@ impl ModbusDriver {
         self.shared.image.read(point, now_ns)
     }
 
-    /// Hands checked values to the task.
+    /// Hands checked values to the tasks.
     pub(crate) fn write(&self, writes: impl Iterator<Item = (usize, f64)>, now_ns: u64) {
         for (point, value) in writes {
             if let Some(planned) = self.shared.plan.points.get(point) {
@@ -94,9 +128,11 @@ impl ModbusDriver {
         }
     }
 
-    /// Puts an errand into the bus's queue.
+    /// Puts an errand into the queue of its unit's connection; a unit without points is asked over the first one.
     pub(crate) fn errand(&self, errand: Errand, until: std::time::Instant) -> Result<Asked, Error> {
-        self.post.send(&self.shared.plan.bus, errand, until)
+        let rank = self.units.binary_search(&errand.unit_id()).unwrap_or(0);
+        let post = self.posts.get(rank % self.posts.len().max(1)).ok_or(Error::Closed)?;
+        post.send(&self.shared.plan.bus, errand, until)
     }
 
     /// What the bus was planned with.
@@ -108,12 +144,12 @@ impl ModbusDriver {
         self.shared.status.get()
     }
 
-    /// Tells the task to bring its outputs to rest and end.
+    /// Tells the tasks to bring their outputs to rest and end.
     pub(crate) fn stop(&self) {
         self.stop.send_replace(true);
     }
 
-    /// Waits for it, with a bound.
+    /// Waits for them, with a bound.
     pub(crate) fn wait_for_end(&self) {
         let longest = Duration::from_millis(CLOSE_WAIT_MS + self.shared.plan.timeout_ms);
         if self.ended.lock().recv_timeout(longest) == Err(mpsc::RecvTimeoutError::Timeout) {

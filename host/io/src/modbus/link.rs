@@ -1,17 +1,22 @@
-//! The task of one Modbus address: it owns the connection, polls the groups and sends the writes.
+//! The task of one connection of a Modbus bus: it polls the groups of its units and sends their writes.
 //!
 //! ```text
-//! connecting ──► serving ──lost, timed out──► waiting (doubling, with spread) ──► connecting
-//!     └──failed──► waiting        └──stop──► last writes ──► ended
+//! connecting ──► serving ──lost──► waiting (doubling, with spread) ──► connecting
+//!     └──failed──► waiting   └──stop──► last writes ──► ended
 //! ```
 //!
-//! One request at a time, because many devices bear no more; writes go before polls. A unit that does not answer behind
-//! a gateway is left alone for a growing while, so that the others keep their pace. After a time-out the connection is
-//! closed: a late answer must not be taken for the next one's.
+//! One request at a time, because many devices bear no more; writes go before polls. A unit that does not answer is left
+//! alone for a growing while, so that the others behind the same address keep their pace. On TCP and on a line the
+//! connection outlives that: a late answer is told from the next one's. After some silences in a row, and at once where
+//! answers carry no number, it is made anew.
 //!
 //! Never: blocks a thread, or touches another bus.
 
-use std::{borrow::Cow, collections::HashMap, sync::Arc, time::Duration};
+use std::{
+    collections::{HashMap, HashSet},
+    sync::Arc,
+    time::Duration,
+};
 
 use bumpless_core::{NoData, Quality};
 use tokio::{
@@ -19,42 +24,28 @@ use tokio::{
     sync::{mpsc, watch},
     time::{Instant, timeout},
 };
-use tokio_modbus::{
-    ExceptionCode, Request, Response, Slave,
-    client::{Client, Context, tcp},
-    slave::SlaveContext,
-};
 
 use super::{
-    WriteWith,
     backoff::Backoff,
+    connection::{Connection, Failure},
     driver::Shared,
-    group::{Group, Item, Table},
+    exception::Exception,
+    group::{Group, Item},
     outbox::{Wish, encoded},
-    wire::Wire,
+    plan::Way,
+    request::{Answer, Request},
+    serial::Serial,
 };
-use crate::{
-    config::OnStop,
-    errand::{Errand, ErrandError, Posted},
-    limits::{BITS_PER_WRITE_MAX, REGISTERS_PER_WRITE_MAX},
-};
+use crate::{config::OnStop, errand::Posted, limits::SILENT_IN_ROW_MAX};
+
+mod errands;
+mod writes;
 
 /// A group and when it is due.
 #[derive(Debug)]
 struct Poll {
-    group: Group,
+    group: Arc<Group>,
     due: Instant,
-}
-
-/// How a request went wrong.
-#[derive(Debug)]
-enum Failure {
-    /// The device answered with an exception; the connection is sound.
-    Exception(u8),
-    /// No answer in time; the connection is no longer to be trusted.
-    TimedOut,
-    /// The connection is gone, or the answer made no sense.
-    Lost(String),
 }
 
 /// How a connection ended.
@@ -73,50 +64,67 @@ struct Quiet {
 /// The task's own state.
 pub(crate) struct Link {
     shared: Arc<Shared>,
+    lane: usize,
+    units: Vec<u8>,
     stop: watch::Receiver<bool>,
     errands: mpsc::Receiver<Posted>,
     polls: Vec<Poll>,
     backoff: Backoff,
     quiet: HashMap<u8, Quiet>,
+    silent_in_row: u32,
+    /// Units without function 22.
+    without_mask: HashSet<u8>,
 }
 
 impl Link {
-    pub(crate) fn new(shared: Arc<Shared>, stop: watch::Receiver<bool>, errands: mpsc::Receiver<Posted>) -> Self {
+    /// The task of connection `lane`, for these units.
+    pub(crate) fn new(
+        shared: Arc<Shared>,
+        lane: usize,
+        units: Vec<u8>,
+        stop: watch::Receiver<bool>,
+        errands: mpsc::Receiver<Posted>,
+    ) -> Self {
         let now = Instant::now();
         let polls = shared
             .plan
             .groups
             .iter()
+            .filter(|group| units.contains(&group.unit_id))
             .map(|group| Poll {
-                group: group.clone(),
+                group: Arc::new(group.clone()),
                 due: now,
             })
             .collect();
         let (min_ms, max_ms) = shared.plan.backoff_ms;
-        let backoff = Backoff::new(min_ms, max_ms, shared.clock.now_ns());
+        let backoff = Backoff::new(min_ms, max_ms, shared.clock.now_ns().wrapping_add(lane as u64));
         Self {
             shared,
+            lane,
+            units,
             stop,
             errands,
             polls,
             backoff,
             quiet: HashMap::new(),
+            silent_in_row: 0,
+            without_mask: HashSet::new(),
         }
     }
 
     /// Runs until told to stop.
     pub(crate) async fn run(mut self) {
         while !self.stopping() {
-            if let Some(mut context) = self.connect().await {
-                let end = self.serve(&mut context).await;
+            if let Some(mut connection) = self.connect().await {
+                let end = self.serve(&mut connection).await;
                 let stopped = matches!(end, End::Stopped);
                 if stopped {
-                    self.last_writes(&mut context).await;
+                    self.last_writes(&mut connection).await;
                 }
-                self.shared.status.update(|s| s.connected = false);
+                self.shared.answers(self.lane, false);
+                // The device sees an orderly end; one that does not care is left to the system.
+                let _ = timeout(self.time_limit(), connection.close()).await;
                 if stopped {
-                    // The device sees an orderly end; one that does not care is left to the system.
-                    let _ = timeout(self.time_limit(), context.disconnect()).await;
                     return;
                 }
             }
@@ -135,31 +143,32 @@ impl Link {
         Duration::from_millis(self.shared.plan.timeout_ms)
     }
 
-    async fn connect(&mut self) -> Option<Context> {
-        let (address, longest) = (&self.shared.plan.address, self.time_limit());
+    async fn connect(&mut self) -> Option<Connection> {
+        let shared = Arc::clone(&self.shared);
+        let longest = self.time_limit();
         let connected = tokio::select! {
             _ = self.stop.wait_for(|stop| *stop) => return None,
-            connected = timeout(longest, TcpStream::connect(address.as_str())) => connected,
+            connected = timeout(longest, open(&shared.plan.way)) => connected,
         };
+        let place = shared.plan.way.place();
         let problem = match connected {
-            Ok(Ok(stream)) => {
-                // Small requests must leave at once. Where the system refuses, they leave a little later.
-                let _ = stream.set_nodelay(true);
-                self.shared.outbox.forget();
+            Ok(Ok(connection)) => {
+                self.shared.outbox.forget(self.lane);
+                self.silent_in_row = 0;
                 self.shared.status.update(|s| s.connections += 1);
-                tracing::info!(bus = %self.shared.plan.bus, address, "connected");
-                return Some(tcp::attach(Wire(stream)));
+                tracing::info!(bus = %self.shared.plan.bus, address = place, "connected");
+                return Some(connection);
             }
-            Ok(Err(error)) => error.to_string(),
-            Err(_) => format!("no connection within {} ms", self.shared.plan.timeout_ms),
+            Ok(Err(problem)) => problem,
+            Err(_) => format!("no connection within {} ms", shared.plan.timeout_ms),
         };
-        self.report(&format!("{address}: {problem}"));
+        self.report(&format!("{place}: {problem}"));
         self.lose_all();
         None
     }
 
     /// Polls and writes until something ends it.
-    async fn serve(&mut self, context: &mut Context) -> End {
+    async fn serve(&mut self, connection: &mut Connection) -> End {
         // Groups that fell due while there was no connection are due now, once.
         let now = Instant::now();
         self.polls.iter_mut().for_each(|p| p.due = p.due.max(now));
@@ -167,19 +176,19 @@ impl Link {
             if self.stopping() {
                 return End::Stopped;
             }
-            if self.shared.outbox.is_waiting()
-                && let Err(end) = self.send_writes(context).await
+            if self.shared.outbox.is_waiting(self.lane)
+                && let Err(end) = self.send_writes(connection).await
             {
                 return end;
             }
             // One between two polls, so that neither waits for the other for long.
             if let Ok(posted) = self.errands.try_recv()
-                && let Err(end) = self.errand(context, posted).await
+                && let Err(end) = self.errand(connection, posted).await
             {
                 return end;
             }
             let Some((number, due)) = self.next_poll() else {
-                // A plan has points, so there are groups; without any there is nothing to do but wait for the stop.
+                // A lane has units, so there are groups; without any there is nothing to do but wait for the stop.
                 let _ = self.stop.wait_for(|stop| *stop).await;
                 continue;
             };
@@ -187,18 +196,18 @@ impl Link {
                 let posted = tokio::select! {
                     biased;
                     _ = self.stop.wait_for(|stop| *stop) => None,
-                    () = self.shared.outbox.notify.notified() => None,
+                    () = self.shared.outbox.notified(self.lane) => None,
                     posted = self.errands.recv() => posted,
                     () = tokio::time::sleep_until(due) => None,
                 };
                 if let Some(posted) = posted
-                    && let Err(end) = self.errand(context, posted).await
+                    && let Err(end) = self.errand(connection, posted).await
                 {
                     return end;
                 }
                 continue;
             }
-            if let Err(end) = self.poll(context, number).await {
+            if let Err(end) = self.poll(connection, number).await {
                 return end;
             }
         }
@@ -217,11 +226,11 @@ impl Link {
             .min_by_key(|(_, due)| *due)
     }
 
-    async fn poll(&mut self, context: &mut Context, number: usize) -> Result<(), End> {
+    async fn poll(&mut self, connection: &mut Connection, number: usize) -> Result<(), End> {
         let Some(poll) = self.polls.get_mut(number) else {
             return Ok(());
         };
-        let group = poll.group.clone();
+        let group = Arc::clone(&poll.group);
         let period = Duration::from_millis(group.period_ms);
         let now = Instant::now();
         let late = now.saturating_duration_since(poll.due) > period;
@@ -233,14 +242,13 @@ impl Link {
         if late {
             self.shared.status.update(|s| s.polls_late += 1);
         }
-        let request = match group.table {
-            Table::Coil => Request::ReadCoils(group.start, group.count),
-            Table::Discrete => Request::ReadDiscreteInputs(group.start, group.count),
-            Table::Holding => Request::ReadHoldingRegisters(group.start, group.count),
-            Table::Input => Request::ReadInputRegisters(group.start, group.count),
+        let request = Request::Read {
+            table: group.table,
+            start: group.start,
+            count: group.count,
         };
         let sent_ns = self.shared.clock.now_ns();
-        let answer = self.request(context, group.unit_id, request).await;
+        let answer = self.request(connection, group.unit_id, &request).await;
         let now_ns = self.shared.clock.now_ns();
         // Somewhere between question and answer the device looked; the middle errs least.
         let at_ns = sent_ns + now_ns.saturating_sub(sent_ns) / 2;
@@ -254,20 +262,15 @@ impl Link {
             )
         };
         match answer {
-            Ok(response) => {
-                if self.take(&group, &response, at_ns) {
-                    self.answered(group.unit_id);
-                    self.shared.status.update(|s| s.polls += 1);
-                    Ok(())
-                } else {
-                    self.report(&format!("{}: the answer has another length than asked for", place()));
-                    self.lose_unit(group.unit_id);
-                    Err(End::Lost)
-                }
-            }
-            Err(Failure::Exception(code)) => {
+            Ok(answer) => {
+                self.take(&group, &answer, at_ns);
                 self.answered(group.unit_id);
-                let parts = if code == u8::from(ExceptionCode::IllegalDataAddress) {
+                self.shared.status.update(|s| s.polls += 1);
+                Ok(())
+            }
+            Err(Failure::Exception(exception)) => {
+                self.answered(group.unit_id);
+                let parts = if exception == Exception::ADDRESS {
                     group.without_gaps()
                 } else {
                     Vec::new()
@@ -275,55 +278,58 @@ impl Link {
                 if parts.len() > 1 {
                     tracing::info!(bus = %self.shared.plan.bus, "{}: read without gaps from now on", place());
                     self.polls.swap_remove(number);
-                    self.polls
-                        .extend(parts.into_iter().map(|group| Poll { group, due: now }));
+                    self.polls.extend(parts.into_iter().map(|group| Poll {
+                        group: Arc::new(group),
+                        due: now,
+                    }));
                     return Ok(());
                 }
-                self.report(&format!("{}: exception {code}, {}", place(), exception_name(code)));
+                self.report(&format!("{}: {exception}", place()));
                 for item in &group.items {
                     self.shared
                         .image
-                        .set(item.point, Err(NoData::DeviceError(code)), Quality::Bad, at_ns);
+                        .set(item.point, Err(NoData::DeviceError(exception.0)), Quality::Bad, at_ns);
                 }
                 Ok(())
             }
-            Err(failure) => Err(self.lost(group.unit_id, &place(), failure)),
+            Err(failure) => self.failed(connection, group.unit_id, &place(), failure),
         }
     }
 
-    /// Puts an answer into the image; false where it does not hold what was asked for.
-    fn take(&self, group: &Group, response: &Response, at_ns: u64) -> bool {
-        // Registers of each point, and a bit as one register.
-        let mut taken: Vec<(&Item, Vec<u16>)> = Vec::with_capacity(group.items.len());
-        match (group.table, response) {
-            (Table::Coil, Response::ReadCoils(bits)) | (Table::Discrete, Response::ReadDiscreteInputs(bits)) => {
-                for item in &group.items {
-                    let Some(on) = bits.get(usize::from(item.start - group.start)) else {
-                        return false;
-                    };
-                    taken.push((item, vec![u16::from(*on)]));
+    /// Puts an answer into the image. Its length is what was asked for.
+    fn take(&self, group: &Group, answer: &Answer, at_ns: u64) {
+        for item in &group.items {
+            let start = usize::from(item.start.saturating_sub(group.start));
+            match answer {
+                Answer::Bits(bits) => {
+                    if let Some(on) = bits.get(start) {
+                        self.seen(item, &[u16::from(*on)], at_ns);
+                    }
                 }
+                Answer::Words(words) => {
+                    if let Some(own) = words.get(start..start + usize::from(item.count)) {
+                        self.seen(item, own, at_ns);
+                    }
+                }
+                Answer::Done | Answer::Identity { .. } => {}
             }
-            (Table::Holding, Response::ReadHoldingRegisters(words))
-            | (Table::Input, Response::ReadInputRegisters(words)) => {
-                if words.len() != usize::from(group.count) {
-                    return false;
-                }
-                for item in &group.items {
-                    let start = usize::from(item.start - group.start);
-                    let Some(own) = words.get(start..start + usize::from(item.count)) else {
-                        return false;
-                    };
-                    taken.push((item, own.to_vec()));
-                }
+        }
+    }
+
+    /// The registers of one point as they were read: for a field of bits, its number.
+    fn seen(&self, item: &Item, words: &[u16], at_ns: u64) {
+        let bits = self.shared.plan.points.get(item.point).and_then(|p| p.bits);
+        match (bits, words) {
+            (Some(bits), [register]) => {
+                let number = [bits.of(*register)];
+                self.shared.outbox.seen(item.point, &number);
+                self.show(item.point, &number, at_ns);
             }
-            _ => return false,
+            _ => {
+                self.shared.outbox.seen(item.point, words);
+                self.show(item.point, words, at_ns);
+            }
         }
-        for (item, words) in taken {
-            self.shared.outbox.seen(item.point, &words);
-            self.show(item.point, &words, at_ns);
-        }
-        true
     }
 
     /// Puts the registers of one point into the image.
@@ -336,245 +342,87 @@ impl Link {
         }
     }
 
-    /// Sends all that waits, neighbours together.
-    async fn send_writes(&mut self, context: &mut Context) -> Result<(), End> {
-        let (wishes, expired) = self.shared.outbox.take(self.shared.clock.now_ns());
-        if expired > 0 {
-            self.report(&format!(
-                "{expired} values waited too long for the device and were given up"
-            ));
-        }
-        let mut batches = self.batches(wishes).into_iter();
-        while let Some(batch) = batches.next() {
-            let Some((unit_id, place, request)) = self.write_request(&batch) else {
-                continue;
-            };
-            // A unit that is quiet keeps its wishes until it is asked again, or they expire.
-            if self.quiet.get(&unit_id).is_some_and(|q| q.until > Instant::now()) {
-                batch.iter().for_each(|wish| self.shared.outbox.put_back(wish));
-                continue;
-            }
-            match self.request(context, unit_id, request).await {
-                Ok(_) => {
-                    let now_ns = self.shared.clock.now_ns();
-                    self.answered(unit_id);
-                    for wish in &batch {
-                        self.shared.outbox.sent(wish, now_ns);
-                        self.show(wish.point, wish.words.as_slice(), now_ns);
-                    }
-                    self.shared.status.update(|s| s.writes += batch.len() as u64);
-                }
-                Err(Failure::Exception(code)) => {
-                    self.answered(unit_id);
-                    self.report(&format!("write to {place}: exception {code}, {}", exception_name(code)));
-                    let now_ns = self.shared.clock.now_ns();
-                    for wish in &batch {
-                        self.shared
-                            .image
-                            .set(wish.point, Err(NoData::DeviceError(code)), Quality::Bad, now_ns);
-                    }
-                }
-                Err(failure) => {
-                    // This batch and the ones behind it wait for the next connection.
-                    for wish in batch.iter().chain(batches.flatten().collect::<Vec<_>>().iter()) {
-                        self.shared.outbox.put_back(wish);
-                    }
-                    return Err(self.lost(unit_id, &format!("write to {place}"), failure));
-                }
-            }
-        }
-        Ok(())
-    }
-
-    /// Wishes that can go in one request, by unit, table and address.
-    fn batches(&self, mut wishes: Vec<Wish>) -> Vec<Vec<Wish>> {
-        let key = |wish: &Wish| {
-            self.shared
-                .plan
-                .points
-                .get(wish.point)
-                .map(|p| (p.unit_id, p.table, p.address))
-        };
-        wishes.sort_by_key(key);
-        let mut batches: Vec<Vec<Wish>> = Vec::new();
-        // Where the last batch ends: unit, table, next address, addresses so far.
-        let mut end: Option<(u8, Table, u32, u32)> = None;
-        for wish in wishes {
-            let Some((unit_id, table, address)) = key(&wish) else {
-                continue;
-            };
-            let count = if table.is_bits() {
-                1
-            } else {
-                wish.words.as_slice().len() as u32
-            };
-            let most = u32::from(if table.is_bits() {
-                BITS_PER_WRITE_MAX
-            } else {
-                REGISTERS_PER_WRITE_MAX
+    /// One request, within its time, and again where it is not answered and may be.
+    async fn request(&self, connection: &mut Connection, unit_id: u8, request: &Request) -> Result<Answer, Failure> {
+        let mut tries = 0;
+        loop {
+            let started = Instant::now();
+            let answer = connection.call(unit_id, request, self.time_limit()).await;
+            let latency_us = u64::try_from(started.elapsed().as_micros()).unwrap_or(u64::MAX);
+            let again = matches!(answer, Err(Failure::Silent(_)))
+                && tries < self.shared.plan.retries
+                && connection.outlives_silence()
+                && !self.stopping();
+            self.shared.status.update(|s| {
+                s.requests += 1;
+                s.retries += u64::from(again);
+                s.latency_us = latency_us;
+                s.latency_us_max = s.latency_us_max.max(latency_us);
             });
-            let joins = self.shared.plan.write_with != WriteWith::Single
-                && end.is_some_and(|(u, t, next, length)| {
-                    (u, t, next) == (unit_id, table, u32::from(address)) && length + count <= most
-                });
-            match batches.last_mut() {
-                Some(batch) if joins => batch.push(wish),
-                _ => batches.push(vec![wish]),
+            if !again {
+                return answer;
             }
-            let before = if joins {
-                end.map_or(0, |(_, _, _, length)| length)
-            } else {
-                0
-            };
-            end = Some((unit_id, table, u32::from(address) + count, before + count));
-        }
-        batches
-    }
-
-    /// The request for a batch, with its unit and its place in words.
-    fn write_request(&self, batch: &[Wish]) -> Option<(u8, String, Request<'static>)> {
-        let first = batch.first()?;
-        let point = self.shared.plan.points.get(first.point)?;
-        let single = self.shared.plan.write_with != WriteWith::Multiple;
-        let words: Vec<u16> = batch.iter().flat_map(|wish| wish.words.as_slice()).copied().collect();
-        let request = match (point.table.is_bits(), words.as_slice()) {
-            (true, [word]) if single => Request::WriteSingleCoil(point.address, *word != 0),
-            (true, words) => Request::WriteMultipleCoils(point.address, words.iter().map(|w| *w != 0).collect()),
-            (false, [word]) if single => Request::WriteSingleRegister(point.address, *word),
-            (false, _) => Request::WriteMultipleRegisters(point.address, Cow::Owned(words)),
-        };
-        Some((
-            point.unit_id,
-            format!(
-                "point {}, unit {}, {} {}",
-                point.id,
-                point.unit_id,
-                point.table.name(),
-                point.address
-            ),
-            request,
-        ))
-    }
-
-    /// One errand. Its asker may be gone, or its time over: then nothing is sent.
-    async fn errand(&mut self, context: &mut Context, posted: Posted) -> Result<(), End> {
-        let Posted { errand, until, reply } = posted;
-        if reply.is_closed() || std::time::Instant::now() >= until {
-            let _ = reply.send(Err(ErrandError::NoTurn));
-            return Ok(());
-        }
-        let (unit_id, request) = match &errand {
-            Errand::Read {
-                unit_id,
-                table,
-                start,
-                count,
-            } => (
-                *unit_id,
-                match table {
-                    Table::Coil => Request::ReadCoils(*start, *count),
-                    Table::Discrete => Request::ReadDiscreteInputs(*start, *count),
-                    Table::Holding => Request::ReadHoldingRegisters(*start, *count),
-                    Table::Input => Request::ReadInputRegisters(*start, *count),
-                },
-            ),
-            Errand::Write {
-                unit_id,
-                table,
-                start,
-                words,
-            } => (
-                *unit_id,
-                if table.is_bits() {
-                    Request::WriteMultipleCoils(*start, words.iter().map(|word| *word != 0).collect())
-                } else {
-                    Request::WriteMultipleRegisters(*start, Cow::Borrowed(words))
-                },
-            ),
-        };
-        let (answer, end) = match self.request(context, unit_id, request).await {
-            Ok(response) => {
-                self.answered(unit_id);
-                let words = match (&errand, response) {
-                    (Errand::Write { .. }, _) => Ok(Vec::new()),
-                    (Errand::Read { count, .. }, Response::ReadCoils(bits) | Response::ReadDiscreteInputs(bits)) => {
-                        Ok(bits.into_iter().take(usize::from(*count)).map(u16::from).collect())
-                    }
-                    (
-                        Errand::Read { count, .. },
-                        Response::ReadHoldingRegisters(words) | Response::ReadInputRegisters(words),
-                    ) if words.len() == usize::from(*count) => Ok(words),
-                    _ => Err(ErrandError::Lost(
-                        "the answer has another length than asked for".to_owned(),
-                    )),
-                };
-                (words, Ok(()))
-            }
-            Err(Failure::Exception(code)) => {
-                self.answered(unit_id);
-                let name = exception_name(code);
-                (Err(ErrandError::Exception { code, name }), Ok(()))
-            }
-            Err(failure) => {
-                let error = match &failure {
-                    Failure::Lost(problem) => ErrandError::Lost(problem.clone()),
-                    _ => ErrandError::NoAnswer(self.shared.plan.timeout_ms),
-                };
-                (Err(error), Err(self.lost(unit_id, &errand.place(), failure)))
-            }
-        };
-        // Nobody waits any more: that is the asker's matter.
-        let _ = reply.send(answer);
-        end
-    }
-
-    /// One request, within its time.
-    async fn request(&self, context: &mut Context, unit_id: u8, request: Request<'_>) -> Result<Response, Failure> {
-        context.set_slave(Slave(unit_id));
-        let started = Instant::now();
-        let answer = timeout(self.time_limit(), context.call(request)).await;
-        let latency_us = u64::try_from(started.elapsed().as_micros()).unwrap_or(u64::MAX);
-        self.shared.status.update(|s| {
-            s.latency_us = latency_us;
-            s.latency_us_max = s.latency_us_max.max(latency_us);
-        });
-        match answer {
-            Ok(Ok(Ok(response))) => Ok(response),
-            Ok(Ok(Err(exception))) => Err(Failure::Exception(exception.into())),
-            Ok(Err(error)) => Err(Failure::Lost(error.to_string())),
-            Err(_) => Err(Failure::TimedOut),
+            tries += 1;
         }
     }
 
     /// A unit answered: it and the connection are well. A connection alone proves little: a frozen device's system
     /// still accepts one.
     fn answered(&mut self, unit_id: u8) {
-        self.shared.status.update(|s| s.connected = true);
+        self.shared.answers(self.lane, true);
         self.backoff.reset();
+        self.silent_in_row = 0;
         self.quiet.remove(&unit_id);
     }
 
-    /// The connection is over. A time-out is one unit's fault as far as we know; anything else is the connection's.
-    fn lost(&mut self, unit_id: u8, place: &str, failure: Failure) -> End {
+    /// A request came to nothing. A silence is one unit's fault as far as we know; a lost connection is everybody's.
+    fn failed(&mut self, connection: &Connection, unit_id: u8, place: &str, failure: Failure) -> Result<(), End> {
         match failure {
-            Failure::TimedOut => {
-                self.report(&format!("{place}: no answer within {} ms", self.shared.plan.timeout_ms));
-                self.lose_unit(unit_id);
-                let (min_ms, max_ms) = self.shared.plan.backoff_ms;
-                let seed = self.shared.clock.now_ns();
-                let quiet = self.quiet.entry(unit_id).or_insert_with(|| Quiet {
-                    backoff: Backoff::new(min_ms, max_ms, seed),
-                    until: Instant::now(),
-                });
-                quiet.until = Instant::now() + quiet.backoff.next_wait();
+            Failure::Exception(exception) => {
+                self.report(&format!("{place}: {exception}"));
+                Ok(())
             }
             Failure::Lost(problem) => {
                 self.report(&format!("{place}: {problem}"));
                 self.lose_all();
+                Err(End::Lost)
             }
-            Failure::Exception(code) => self.report(&format!("{place}: exception {code}, {}", exception_name(code))),
+            Failure::Malformed(problem) => {
+                self.report(&format!("{place}: {problem}"));
+                self.leave_alone(unit_id);
+                Ok(())
+            }
+            Failure::Silent(problem) => {
+                self.report(&format!("{place}: {problem}"));
+                self.leave_alone(unit_id);
+                self.silent_in_row += 1;
+                let enough =
+                    self.silent_in_row >= SILENT_IN_ROW_MAX && matches!(self.shared.plan.way, Way::Network { .. });
+                if enough || !connection.outlives_silence() {
+                    return Err(End::Lost);
+                }
+                Ok(())
+            }
         }
-        End::Lost
+    }
+
+    /// A unit is not asked for a growing while.
+    fn leave_alone(&mut self, unit_id: u8) {
+        for (number, point) in self.shared.plan.points.iter().enumerate() {
+            if point.unit_id == unit_id {
+                self.shared.image.lose(number);
+            }
+        }
+        let (min_ms, max_ms) = self.shared.plan.backoff_ms;
+        let seed = self.shared.clock.now_ns();
+        let quiet = self.quiet.entry(unit_id).or_insert_with(|| Quiet {
+            backoff: Backoff::new(min_ms, max_ms, seed),
+            until: Instant::now(),
+        });
+        quiet.until = Instant::now() + quiet.backoff.next_wait();
+        if self.units.iter().all(|unit| self.quiet.contains_key(unit)) {
+            self.shared.answers(self.lane, false);
+        }
     }
 
     /// Counts an error, keeps its text, and logs it once until another comes.
@@ -585,23 +433,19 @@ impl Link {
     }
 
     fn lose_all(&self) {
-        (0..self.shared.plan.points.len()).for_each(|point| self.shared.image.lose(point));
-    }
-
-    fn lose_unit(&self, unit_id: u8) {
         for (number, point) in self.shared.plan.points.iter().enumerate() {
-            if point.unit_id == unit_id {
+            if self.units.contains(&point.unit_id) {
                 self.shared.image.lose(number);
             }
         }
     }
 
     /// What waits is sent, then the safe values where they are wanted.
-    async fn last_writes(&mut self, context: &mut Context) {
+    async fn last_writes(&mut self, connection: &mut Connection) {
         if self.shared.plan.on_stop == OnStop::Safe {
             let now_ns = self.shared.clock.now_ns();
             for (point, planned) in self.shared.plan.points.iter().enumerate() {
-                if let Some(safe) = planned.safe {
+                if let Some(safe) = planned.safe.filter(|_| self.units.contains(&planned.unit_id)) {
                     self.shared.outbox.put(Wish {
                         point,
                         words: encoded(planned, safe),
@@ -611,22 +455,31 @@ impl Link {
             }
         }
         // Failures have been reported; there is no later.
-        let _ = self.send_writes(context).await;
+        let _ = self.send_writes(connection).await;
     }
 }
 
-/// The names of the Modbus application protocol V1.1b3, section 7.
-const fn exception_name(code: u8) -> &'static str {
-    match code {
-        1 => "illegal function",
-        2 => "illegal data address",
-        3 => "illegal data value",
-        4 => "server device failure",
-        5 => "acknowledge, still working",
-        6 => "server device busy",
-        8 => "memory parity error",
-        10 => "gateway path unavailable",
-        11 => "gateway target device failed to respond",
-        _ => "unknown to the standard",
+/// A connection, or why there is none, in words.
+async fn open(way: &Way) -> Result<Connection, String> {
+    match way {
+        Way::Line { device, line } => {
+            let serial = Serial::open(device, *line).map_err(|error| {
+                format!("{error}; check that the line is there and that this user may use it (group dialout)")
+            })?;
+            Ok(Connection::over_line(serial, line.pause()))
+        }
+        Way::Network { address, framing, tls } => {
+            let stream = TcpStream::connect(address.as_str()).await.map_err(|e| e.to_string())?;
+            // Small requests must leave at once. Where the system refuses, they leave a little later.
+            let _ = stream.set_nodelay(true);
+            let Some(tls) = tls else {
+                return Ok(Connection::over_network(stream, *framing));
+            };
+            let stream =
+                tls.connector.connect(tls.name.clone(), stream).await.map_err(|error| {
+                    format!("TLS: {error}; check tls.ca, tls.server_name and the device's certificate")
+                })?;
+            Ok(Connection::over_network(stream, *framing))
+        }
     }
 }

@@ -62,6 +62,14 @@ pub struct Words {
 }
 
 impl Words {
+    /// One register.
+    pub(crate) const fn one(word: u16) -> Self {
+        Self {
+            words: [word, 0, 0, 0],
+            count: 1,
+        }
+    }
+
     /// The registers.
     #[must_use]
     pub fn as_slice(&self) -> &[u16] {
@@ -158,6 +166,50 @@ impl ValueType {
     }
 }
 
+/// Some neighbouring bits of a register, as an unsigned number.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct BitField {
+    first: u8,
+    count: u8,
+}
+
+impl BitField {
+    /// `count` bits from `first` on, 0 the least significant; none where they leave the register.
+    #[must_use]
+    pub const fn new(first: u8, count: u8) -> Option<Self> {
+        if first < 16 && count >= 1 && count <= 16 - first {
+            Some(Self { first, count })
+        } else {
+            None
+        }
+    }
+
+    /// The greatest number.
+    #[must_use]
+    pub const fn most(self) -> u16 {
+        u16::MAX >> (16 - self.count)
+    }
+
+    /// Ones where the field is in its register.
+    #[must_use]
+    pub const fn mask(self) -> u16 {
+        self.most() << self.first
+    }
+
+    /// The number in a register.
+    #[must_use]
+    pub const fn of(self, register: u16) -> u16 {
+        (register & self.mask()) >> self.first
+    }
+
+    /// A register with the number in its place and zeros elsewhere; a greater number is held at the greatest.
+    #[must_use]
+    pub const fn put(self, number: u16) -> u16 {
+        let most = self.most();
+        (if number > most { most } else { number }) << self.first
+    }
+}
+
 const fn in_order(word: u16, order: ByteOrder) -> u16 {
     match order {
         ByteOrder::Big => word,
@@ -211,6 +263,19 @@ mod tests {
             );
         }
         assert_eq!(ValueType::F32.decode(&[1], HighFirst, Big), None);
+    }
+
+    #[test]
+    fn fields_are_taken_from_and_put_into_their_register() {
+        let field = BitField::new(4, 3).unwrap();
+        assert_eq!((field.most(), field.mask()), (7, 0x70));
+        assert_eq!((field.of(0xFFAF), field.put(5), field.put(9)), (2, 0x50, 0x70));
+        let whole = BitField::new(0, 16).unwrap();
+        assert_eq!((whole.most(), whole.of(0xABCD)), (0xFFFF, 0xABCD));
+        assert_eq!(BitField::new(15, 1).map(BitField::mask), Some(0x8000));
+        for (first, count) in [(16, 1), (0, 0), (0, 17), (15, 2), (255, 255)] {
+            assert_eq!(BitField::new(first, count), None, "{first} {count}");
+        }
     }
 
     #[test]
