@@ -3,6 +3,7 @@
 //! ```text
 //! Deadline, Overdue ─► desk ─► Sample on its way ─► Deliver ─► host: seat ─► Commit on its way ─► Deliver ─► desk: check, take
 //!                                                                                                  └─► actuator, Record to all
+//!                                   a member ─► Held ─► the outcomes up to it are told   (or the disk, where it is quick)
 //! Lose, Repeat: a message.  Crash, Return: a host.  Gone, Back: what the home believes of it.  Restart: the home.
 //! ```
 //! Never: judges (that is `rules`), or decides anything that the product's core decides.
@@ -15,7 +16,7 @@ use std::{
 };
 
 use bumpless_core::{
-    Command, CommandBody, CommandId, Event, HostId, Outcome, Record,
+    Command, CommandBody, CommandId, Event, HostId, Outcome, Record, Redundancy,
     desk::{Desk, Dispatch},
     protocol::{Answer, Refusal, Sample},
     seat::{self, Base, Conclusion, Stepped},
@@ -42,8 +43,8 @@ pub struct Bounds {
     pub crashes: u8,
     /// Deaths of the home.
     pub restarts: u8,
-    /// Commands, at most 3: two setpoints and, last, another revision.
-    pub commands: usize,
+    /// Commands by number in the order in which they are given: 0 and 1 are setpoints, 2 is another revision.
+    pub commands: &'static [usize],
     /// The home's disk is behind by one record when it dies, as a disk that is written behind the cycle may be.
     pub lazy_disk: bool,
 }
@@ -236,7 +237,7 @@ impl Cell {
                 actions.push(Action::Lose(number));
             }
         }
-        if state.asked < b.commands {
+        if state.asked < b.commands.len() {
             actions.push(Action::Ask);
         }
         for (number, host) in state.hosts.iter().enumerate() {
@@ -282,7 +283,8 @@ impl Cell {
             }
             Action::Ask => {
                 // A full queue or a known outcome cannot be: there are three commands, each asked for once.
-                let _queued = state.desk.command(command(state.asked));
+                let asked = self.bounds.commands.get(state.asked).copied().unwrap_or_default();
+                let _queued = state.desk.command(command(asked));
                 state.asked += 1;
             }
             Action::Crash(number) => {
@@ -336,11 +338,22 @@ impl Cell {
                     .as_ref()
                     .is_none_or(|last| last.position() < record.position());
                 if newer && !host.dead {
+                    // Where the disk is quick everything is told already, and what a member says changes nothing.
+                    if self.bounds.lazy_disk && record.has_news_for(host.last.as_deref()) {
+                        let held = Answer::Held {
+                            loop_id: record.loop_id.clone(),
+                            term: record.term,
+                            seq: record.seq,
+                            host: host_id(number),
+                        };
+                        state.net.push(Message::Answer(Box::new(held)));
+                    }
                     host.last = Some(record);
                 }
             }
             Message::Answer(answer) => match *answer {
                 Answer::Commit(record) => self.commit(state, *record),
+                Answer::Held { term, seq, .. } => state.told((term, seq)),
                 other => {
                     let dispatch = state.desk.answered(state.now_ns, &other);
                     state.send(dispatch);
@@ -401,6 +414,7 @@ impl Cell {
             standing,
             events,
             probation,
+            redundancy: Redundancy::default(),
             step: Ok(step),
             cycle_ns: 0,
         });
@@ -459,8 +473,13 @@ impl Cell {
         {
             state.desk.revise(state.now_ns, Arc::clone(&law.spec), 0);
         }
-        let done = record.applied.iter().filter(|applied| applied.outcome == Outcome::Done);
-        state.acknowledged.extend(done.map(|applied| applied.id));
+        // A disk that is behind has the record before this one now.
+        let kept = match (&state.before_last, self.bounds.lazy_disk) {
+            (Some(before), true) if self.broken != Some(Broken::ToldTooSoon) => before.position(),
+            (None, true) if self.broken != Some(Broken::ToldTooSoon) => (0, 0),
+            _ => record.position(),
+        };
+        state.told(kept);
         for number in 0..state.hosts.len() {
             state.net.push(Message::Record(number, Arc::clone(&record)));
         }
@@ -516,6 +535,13 @@ impl Cell {
 }
 
 impl State {
+    /// Outcomes up to this position outlive the home: somebody is told of them.
+    fn told(&mut self, position: (u64, u64)) {
+        let told = self.desk.kept(position).into_iter().map(|(applied, _)| applied);
+        let done = told.filter(|applied| applied.outcome == Outcome::Done);
+        self.acknowledged.extend(done.map(|applied| applied.id));
+    }
+
     fn send(&mut self, dispatch: Option<Dispatch>) {
         if let Some(Dispatch::Send(sample)) = dispatch {
             self.net.push(Message::Sample(sample));

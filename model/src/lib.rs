@@ -8,6 +8,7 @@
 //! ```
 //! - `law`: the counting law as a specification and its wiring.
 //! - `cell`: the state of the whole, and what each event does to it.
+//! - `table`: the cells that are checked, and the rules that are taken away.
 //! - `rules`: what must hold in every state, and the rules that can be broken on purpose to see that it shows.
 //!
 //! Time only passes with a deadline or with the moment when a commit is overdue; a message may stay on its way over both,
@@ -17,6 +18,8 @@
 mod cell;
 mod law;
 mod rules;
+mod table;
 
 pub use cell::{Action, Bounds, Cell, State};
 pub use rules::{Broken, RULES};
+pub use table::{CELLS, DEEP, QUIET, REMOVALS, Removal};

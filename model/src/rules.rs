@@ -18,6 +18,8 @@ pub enum Broken {
     OutputsApart,
     /// A home that restarts begins its terms anew.
     TermsAgain,
+    /// A command is acknowledged when its record is taken, whoever has it.
+    ToldTooSoon,
 }
 
 /// The names of the rules.

@@ -16,7 +16,7 @@ use serde_json::Value;
 const LINES_MAX: usize = 600;
 
 /// What each room may use of the others. Nothing imports upwards; `io engine store cell` never import each other.
-const ROOMS: [(&str, &[&str]); 17] = [
+const ROOMS: [(&str, &[&str]); 18] = [
     ("bumpless-core", &[]),
     ("bumpless-io", &["bumpless-core"]),
     ("bumpless-engine", &["bumpless-core"]),
@@ -58,6 +58,7 @@ const ROOMS: [(&str, &[&str]); 17] = [
     ("bumpless-on-off", &["bumpless-sdk"]),
     ("bumpless-cascade", &["bumpless-isa", "bumpless-sdk"]),
     ("bumpless-model", &["bumpless-core"]),
+    ("bumpless-simulation", &["bumpless-core"]),
     ("xtask", &["bumpless-core"]),
 ];
 

@@ -29,6 +29,19 @@ enum Command {
         #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
         arguments: Vec<String>,
     },
+    /// Takes every course of small cells with a model checker: `cargo xtask model [--deep] [--json]`.
+    Model {
+        /// For the checker: see `cargo xtask model -- --help`.
+        #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
+        arguments: Vec<String>,
+    },
+    /// Runs cells of thousands of hosts in simulated time under faults drawn from a seed:
+    /// `cargo xtask simulate [--hosts N] [--loops N] [--faults KINDS] [--seconds N] [--seed S] [--sizes 10,100,1000] [--json]`.
+    Simulate {
+        /// For the simulation: see `cargo xtask simulate -- --help`.
+        #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
+        arguments: Vec<String>,
+    },
     /// Writes docs/openapi.json from the code.
     Openapi,
 }
@@ -39,6 +52,8 @@ fn main() -> ExitCode {
         Command::Test { fast } => check::test(fast),
         Command::Demo { arguments } => product::demo(&arguments),
         Command::Bench { arguments } => product::bench(&arguments),
+        Command::Model { arguments } => product::tool("bumpless-model", &arguments),
+        Command::Simulate { arguments } => product::tool("bumpless-simulation", &arguments),
         Command::Openapi => product::openapi(),
     };
     match done {
@@ -71,6 +86,8 @@ mod tests {
         assert!(matches!(parsed, Command::Bench { arguments } if arguments == ["failover", "--quick", "--json"]));
         let parsed = Command::try_parse_from(["xtask", "demo", "--for", "5"]).expect("good");
         assert!(matches!(parsed, Command::Demo { arguments } if arguments == ["--for", "5"]));
+        let parsed = Command::try_parse_from(["xtask", "simulate", "--hosts", "10", "--json"]).expect("good");
+        assert!(matches!(parsed, Command::Simulate { arguments } if arguments == ["--hosts", "10", "--json"]));
         assert!(Command::try_parse_from(["xtask", "test", "--slow"]).is_err());
     }
 }

@@ -1,4 +1,4 @@
-//! `cargo xtask demo`, `bench` and `openapi`: builds what is needed, then runs the product.
+//! `cargo xtask demo`, `bench`, `model`, `simulate` and `openapi`: builds what is needed, then runs the product.
 
 use std::process::Stdio;
 
@@ -34,6 +34,16 @@ pub fn bench(arguments: &[String]) -> Result<(), Error> {
         "build --release --package bumpless-app --package bumpless-bench",
     ))?;
     run(program(target_folder().join("release/bumpless-bench")).args(arguments))
+}
+
+/// Builds a program of the workspace, named as its package, with optimisation, and runs it; arguments go to it. It needs no
+/// component and no host.
+///
+/// # Errors
+/// What does not build, or what the program found.
+pub fn tool(name: &str, arguments: &[String]) -> Result<(), Error> {
+    run(&mut cargo(&format!("build --release --package {name}")))?;
+    run(program(target_folder().join("release").join(name)).args(arguments))
 }
 
 /// Writes `docs/openapi.json` from the code.

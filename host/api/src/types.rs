@@ -27,9 +27,9 @@ pub use loops::{
     Apply, Command, Failure, HandOver, Loop, LoopDraft, Loops, ModeRequest, MoveRequest, OutputLimit, OutputRequest,
     Policy, RollbackRequest, SetRequest, SetpointRequest, SwapRequest, Tally,
 };
-pub use record::{Alarm, Applied, Event, LogLine, Message, Reading, Record};
+pub use record::{Alarm, Applied, Aside, Event, LogLine, Message, Reading, Record, Redundancy, Vote};
 pub use rollouts::{OnFailure, Rollout, RolloutLoop, RolloutRequest, RolloutStage, RolloutState, Rollouts, SilentHost};
-pub use words::{Direction, LogLevel, Mode, OnBump, OnFault, PortKind, Priority, Quality, Strategy};
+pub use words::{Direction, LogLevel, Mode, OnBump, OnFault, OnFewer, PortKind, Priority, Quality, Strategy};
 
 pub(crate) use history::window;
 pub(crate) use loops::Depth;

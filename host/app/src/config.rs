@@ -17,6 +17,9 @@
 //! enabled = true
 //! bytes_max_mib = 512              # then the oldest cycles go
 //!
+//! [testing]                        # a test device; only in a cell whose name begins with "test"
+//! flip_bits_every = 100            # every so-manieth step of this host comes out with a bit turned over
+//!
 //! [[bus]]                          # points, if this host serves any
 //! id = "plant"
 //! driver = "sim"
@@ -33,7 +36,10 @@ use bumpless_core::{CellName, HostId};
 use bumpless_io::BusConfig;
 use serde::{Deserialize, Serialize};
 
+mod testing;
+
 use crate::{error::Error, realtime::Realtime};
+use testing::TestingTable;
 
 /// Bytes of a configuration file: thousands of points fit; a mistaken path to a large file does not.
 const FILE_BYTES_MAX: u64 = 16 * 1024 * 1024;
@@ -89,6 +95,8 @@ pub(crate) struct File {
     loops: LoopsTable,
     #[serde(default)]
     history: HistoryTable,
+    #[serde(default, skip_serializing_if = "TestingTable::is_empty")]
+    testing: TestingTable,
 }
 
 fn data_default() -> PathBuf {
@@ -234,6 +242,8 @@ impl File {
             place: format!("key {place}"),
             reason,
         };
+        let mut loops = self.loops.checked(&wrong)?;
+        loops.flip_bits_every = self.testing.checked(&self.cell.name, &wrong)?;
         let mut cell = bumpless_cell::Config::new(self.cell.name, self.host.clone());
         cell.connect = self.cell.connect;
         cell.scouting = self.cell.scouting;
@@ -290,7 +300,7 @@ impl File {
             control,
             buses,
             engine: self.engine.checked(&wrong)?,
-            loops: self.loops.checked(&wrong)?,
+            loops,
             history_bytes_max: self.history.checked(&wrong)?,
         })
     }
@@ -346,6 +356,7 @@ impl LoopsTable {
         let default = bumpless_loops::Config::default();
         Ok(bumpless_loops::Config {
             workers: in_range(wrong, "loops.workers", self.workers, default.workers, 1, 64)?,
+            ..default
         })
     }
 }
@@ -464,7 +475,15 @@ mod tests {
     #[test]
     fn bad_files_say_where_and_what_helps() {
         let bus = "[[bus]]\nid = \"plant\"\ndriver = \"sim\"\n";
-        let table: [(String, &[&str]); 19] = [
+        let table: [(String, &[&str]); 21] = [
+            (
+                format!("{LEAST}[testing]\nflip_bits_every = 5"),
+                &["key testing", "cell demo may be a real one", "begins with \"test\""],
+            ),
+            (
+                "host = \"a\"\n[cell]\nname = \"test-1\"\n[testing]\nflip_bits_every = 0".into(),
+                &["key testing.flip_bits_every", "it is 0"],
+            ),
             (String::new(), &["host.toml", "missing field `host`"]),
             (
                 "host = \"A\"\n[cell]\nname = \"demo\"".into(),

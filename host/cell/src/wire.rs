@@ -13,7 +13,7 @@
 
 use bumpless_core::{
     Record,
-    limits::{PORTS_MAX, STATE_BYTES_MAX},
+    limits::{PORTS_MAX, REPLICAS_MAX, STATE_BYTES_MAX},
     protocol::{Answer, Sample, StepAnswer, StepRequest},
 };
 use serde::{Serialize, de::DeserializeOwned};
@@ -25,7 +25,7 @@ use crate::{
 };
 
 /// The version that this host writes and reads.
-pub const VERSION: u8 = 1;
+pub const VERSION: u8 = 2;
 
 /// What can be sent. The bound and the checks of each message stand beside its name.
 pub trait Letter: Serialize + DeserializeOwned {
@@ -63,7 +63,7 @@ impl Letter for Answer {
     fn check(&self) -> Result<(), String> {
         match self {
             Self::Commit(record) => record.check(),
-            Self::NeedRecord { .. } | Self::Decline { .. } => Ok(()),
+            Self::NeedRecord { .. } | Self::Decline { .. } | Self::Held { .. } => Ok(()),
         }
     }
 }
@@ -76,6 +76,8 @@ impl Letter for Record {
         at_most("outputs", self.outputs.len(), PORTS_MAX)?;
         at_most("wanted outputs", self.wanted.len(), PORTS_MAX)?;
         at_most("manual outputs", self.manual.len(), PORTS_MAX)?;
+        let aside = self.redundancy.vote.as_ref().map_or(0, |vote| vote.aside.len());
+        at_most("replicas without a vote", aside, REPLICAS_MAX)?;
         at_most("bytes of state", self.state.len(), STATE_BYTES_MAX)
     }
 }

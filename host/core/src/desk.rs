@@ -1,6 +1,7 @@
 //! The home's side of one loop: when a cycle is due, who runs it, when its commit is overdue, and which commands wait.
 //!
-//! Owns the loop's [`Arbiter`], its schedule and its queue of commands. Never: reads points, writes outputs or sends; it
+//! Owns the loop's [`Arbiter`], its schedule, its queue of commands, and which of their outcomes may be told: only those whose
+//! record outlives this home, because it is on its disk or another host has it ([`Desk::kept`]). No cycle waits for that. Never: reads points, writes outputs or sends; it
 //! says what is to be sent, and the shell around it (crate `loops`) does it.
 //!
 //! ```text
@@ -100,6 +101,8 @@ pub struct Desk {
     waiting: Option<Waiting>,
     last: Option<Arc<Record>>,
     commands: VecDeque<Command>,
+    /// Outcomes whose record only this process has, as far as it knows; with `commands` at most [`COMMANDS_WAITING_MAX`].
+    unkept: VecDeque<(Applied, Arc<Record>)>,
     messages: VecDeque<Message>,
     wanted_owner: Option<HostId>,
     tally: Tally,
@@ -125,6 +128,7 @@ impl Desk {
             waiting: None,
             last,
             commands: VecDeque::new(),
+            unkept: VecDeque::new(),
             messages: VecDeque::new(),
             wanted_owner: None,
             tally: Tally::default(),
@@ -203,6 +207,9 @@ impl Desk {
 
     /// Takes a command in. Asking twice with one id does it once.
     pub fn command(&mut self, command: Command) -> Queued {
+        if self.unkept.iter().any(|(a, _)| a.id == command.id) {
+            return Queued::Waits;
+        }
         if let Some(applied) = self
             .last
             .as_ref()
@@ -213,7 +220,7 @@ impl Desk {
         if self.commands.iter().any(|c| c.id == command.id) {
             return Queued::Waits;
         }
-        if self.commands.len() >= COMMANDS_WAITING_MAX {
+        if self.commands.len() + self.unkept.len() >= COMMANDS_WAITING_MAX {
             return Queued::Full;
         }
         self.commands.push_back(command);
@@ -347,7 +354,7 @@ impl Desk {
             Answer::NeedRecord { term, seq, owner, .. } | Answer::Decline { term, seq, owner, .. } => {
                 (*term, *seq, owner)
             }
-            Answer::Commit(_) => return None,
+            Answer::Commit(_) | Answer::Held { .. } => return None,
         };
         let waiting = self.waiting.as_mut()?;
         if (term, seq) != (self.arbiter.term(), waiting.sample.seq) || self.arbiter.owner() != Some(from) {
@@ -384,15 +391,40 @@ impl Desk {
         record.committed_after_ns = now_ns.saturating_sub(record.at_ns);
         self.arbiter.take(&record);
         self.tally.taken += 1;
-        self.commands.retain(|c| !record.applied.iter().any(|a| a.id == c.id));
+        let outcomes = record
+            .applied
+            .iter()
+            .filter(|a| self.commands.iter().any(|c| c.id == a.id));
+        let outcomes: Vec<Applied> = outcomes.cloned().collect();
+        if !outcomes.is_empty() {
+            self.commands.retain(|c| !outcomes.iter().any(|a| a.id == c.id));
+        }
         if let Some(waiting) = self.waiting.take() {
             let seen = waiting.sample.messages.len().min(self.messages.len());
             self.messages.drain(..seen);
         }
         self.suspects.retain(|s| s.host != record.owner);
         let record = Arc::new(record);
+        self.unkept
+            .extend(outcomes.into_iter().map(|a| (a, Arc::clone(&record))));
         self.last = Some(Arc::clone(&record));
         record
+    }
+
+    /// A record at `position`, or a later one, is on this home's disk, or at another host: the outcomes up to it, each with
+    /// the record that holds it, may be told now. A position that was never taken counts for nothing.
+    pub fn kept(&mut self, position: (u64, u64)) -> Vec<(Applied, Arc<Record>)> {
+        if position > self.arbiter.last() {
+            return Vec::new();
+        }
+        let n = self.unkept.iter().take_while(|(_, r)| r.position() <= position).count();
+        self.unkept.drain(..n).collect()
+    }
+
+    /// Position of the latest record with an outcome that may not be told yet.
+    #[must_use]
+    pub fn unkept(&self) -> Option<(u64, u64)> {
+        self.unkept.back().map(|(_, r)| r.position())
     }
 
     /// Goes on under another revision, after a record that carries it was taken.

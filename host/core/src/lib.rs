@@ -6,7 +6,7 @@
 //! same code runs in a host, in a test and under a model checker.
 //!
 //! Reading order: the nouns (`name` to `record`), the messages (`protocol`), then the decisions along one cycle
-//! (`tick`, `desk` with `arbiter`, `seat` with `select` and `swap`, `guard`), then `place` and `indices`.
+//! (`tick`, `desk` with `arbiter`, `seat` with `select`, `vote` and `swap`, `guard`), then `place` and `indices`.
 
 pub mod limits;
 
@@ -20,6 +20,7 @@ pub mod name;
 pub mod protocol;
 pub mod reading;
 pub mod record;
+pub mod redundancy;
 pub mod spec;
 pub mod wiring;
 
@@ -32,6 +33,7 @@ pub mod seat;
 pub mod select;
 pub mod swap;
 pub mod tick;
+pub mod vote;
 
 pub use admission::{Admission, Finding, Fit, Migrated, Severity, Verdict};
 pub use component::{ComponentEvent, ComponentInfo, ComponentInfoError, Edition};
@@ -42,5 +44,6 @@ pub use intent::{Intent, IntentError};
 pub use name::{BusId, CellName, HostId, LoopId, NameError, PointId};
 pub use reading::{NoData, Quality, Reading};
 pub use record::{Applied, Command, CommandBody, CommandId, Event, Outcome, Record};
-pub use spec::{LoopSpec, Mode, OnBump, OnFault, OutputLimit, Policy, SpecError, Strategy};
+pub use redundancy::Redundancy;
+pub use spec::{LoopSpec, Mode, OnBump, OnFault, OnFewer, OutputLimit, Policy, SpecError, Strategy};
 pub use wiring::Wiring;

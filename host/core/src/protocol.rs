@@ -5,6 +5,7 @@
 //!                    owner ◄── StepAnswer ──── replica
 //! home ◄── Commit ── owner
 //! home ── Record ──► owner, standbys, history, live feed
+//! home ◄── Held ── a standby or owner, for a record with a new outcome of a command
 //! ```
 //!
 //! The home keeps the loop's time: it freezes the sample at the absolute deadline and names the owner in it. The record
@@ -86,6 +87,17 @@ pub enum Answer {
         /// In words.
         reason: String,
     },
+    /// A member has this record, which holds an outcome that it had not seen: the outcome outlives the home.
+    Held {
+        /// The loop.
+        loop_id: LoopId,
+        /// The record's term.
+        term: u64,
+        /// The record's number.
+        seq: u64,
+        /// Who has it.
+        host: HostId,
+    },
 }
 
 impl Answer {
@@ -94,7 +106,7 @@ impl Answer {
     pub fn loop_id(&self) -> &LoopId {
         match self {
             Self::Commit(record) => &record.loop_id,
-            Self::NeedRecord { loop_id, .. } | Self::Decline { loop_id, .. } => loop_id,
+            Self::NeedRecord { loop_id, .. } | Self::Decline { loop_id, .. } | Self::Held { loop_id, .. } => loop_id,
         }
     }
 }

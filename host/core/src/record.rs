@@ -10,6 +10,7 @@ use crate::{
     frame::{AlarmChange, LogLine, Message},
     name::{HostId, LoopId},
     reading::Reading,
+    redundancy::Redundancy,
     spec::Mode,
 };
 
@@ -108,6 +109,37 @@ pub enum Event {
     Limited(u8),
     /// A required input was bad.
     BadInput(u8),
+    /// Fewer replicas than the loop asks for can step now, and fewer than before.
+    RedundancyLost {
+        /// Those that can, the owner among them.
+        have: u8,
+        /// Those that the loop asks for.
+        want: u8,
+    },
+    /// As many replicas as the loop asks for can step again.
+    RedundancyRestored {
+        /// Those that the loop asks for.
+        want: u8,
+    },
+    /// A replica's step was not what the majority's was, to the last bit: it has no vote until further notice.
+    Dissent {
+        /// The replica.
+        replica: HostId,
+    },
+    /// A replica without a vote agreed often enough to have one again.
+    Readmitted {
+        /// The replica.
+        replica: HostId,
+    },
+    /// Too few equal answers came in time; the cycle is a faulty one.
+    NoMajority {
+        /// Answers that came.
+        answers: u8,
+        /// Of these, the most that were equal.
+        agreed: u8,
+        /// Equal answers that were needed.
+        needed: u8,
+    },
 }
 
 /// What one cycle leaves. Written once by the owner, completed and ordered by the arbiter.
@@ -125,6 +157,8 @@ pub struct Record {
     pub revision: u64,
     /// The component that stepped.
     pub digest: Digest,
+    /// The I/O host that sent the sample and orders the loop's records.
+    pub home: HostId,
     /// The host that ran the cycle.
     pub owner: HostId,
     /// The host whose replica gave the effects.
@@ -153,6 +187,8 @@ pub struct Record {
     pub faults_in_row: u32,
     /// While a swap is on probation: the revision to fall back to and the cycles left.
     pub probation: Option<(u64, u32)>,
+    /// What the cycle could count on.
+    pub redundancy: Redundancy,
     /// Outcomes of the latest commands, oldest first.
     pub applied: Vec<Applied>,
     /// What the cycle met.
@@ -177,6 +213,18 @@ impl Record {
     pub const fn position(&self) -> (u64, u64) {
         (self.term, self.seq)
     }
+
+    /// Does it hold an outcome that `before` does not? A member that sees one for the first time tells the home that it has
+    /// it; see [`crate::desk::Desk::kept`].
+    #[must_use]
+    pub fn has_news_for(&self, before: Option<&Self>) -> bool {
+        let known = before.map(|r| r.applied.as_slice()).unwrap_or_default();
+        // The latest stand at the end, and in almost every cycle both ends are the same.
+        if self.applied.last().map(|a| a.id) == known.last().map(|a| a.id) {
+            return false;
+        }
+        self.applied.iter().any(|a| !known.iter().any(|k| k.id == a.id))
+    }
 }
 
 /// A plain record for tests of this crate.
@@ -189,6 +237,7 @@ pub(crate) fn test_record() -> Record {
         after: (0, 0),
         revision: 1,
         digest: Digest::of(b"a"),
+        home: HostId::new("home").expect("valid"),
         owner: HostId::new("h1").expect("valid"),
         stepped_by: HostId::new("h1").expect("valid"),
         at_ns: 1_000,
@@ -203,6 +252,7 @@ pub(crate) fn test_record() -> Record {
         state: Arc::from([]),
         faults_in_row: 0,
         probation: None,
+        redundancy: Redundancy::default(),
         applied: vec![],
         events: vec![],
         alarms: vec![],

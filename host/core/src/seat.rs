@@ -18,6 +18,7 @@ use crate::{
     protocol::Sample,
     reading::Reading,
     record::{Applied, CommandBody, CommandId, Event, Outcome, Record},
+    redundancy::Redundancy,
     spec::{LoopSpec, Mode, OnFault},
     wiring::Wiring,
 };
@@ -260,6 +261,8 @@ pub struct Conclusion<'a> {
     pub events: Vec<Event>,
     /// Probation to carry; see [`crate::swap::probation_after`].
     pub probation: Option<(u64, u32)>,
+    /// What the cycle could count on.
+    pub redundancy: Redundancy,
     /// The step, or why there is none.
     pub step: Result<Stepped, Fault>,
     /// Time from the sample's arrival until now, in ns.
@@ -280,6 +283,7 @@ pub fn conclude(c: Conclusion<'_>) -> Record {
         mut standing,
         mut events,
         probation,
+        redundancy,
         step,
         cycle_ns,
     } = c;
@@ -341,6 +345,7 @@ pub fn conclude(c: Conclusion<'_>) -> Record {
             )
         }
     };
+    events.extend(redundancy.news(base.map(|r| &r.redundancy)));
     let finite = |values: Vec<f64>, or: &[f64]| -> Vec<f64> {
         values
             .into_iter()
@@ -365,6 +370,7 @@ pub fn conclude(c: Conclusion<'_>) -> Record {
         after: sample.last,
         revision: spec.revision,
         digest: spec.digest,
+        home: sample.home.clone(),
         owner: owner.clone(),
         stepped_by: by,
         at_ns: sample.at_ns,
@@ -382,6 +388,7 @@ pub fn conclude(c: Conclusion<'_>) -> Record {
         state: Arc::from(effects.state),
         faults_in_row,
         probation,
+        redundancy,
         applied: standing.applied,
         events,
         alarms: effects.alarms,

@@ -145,7 +145,8 @@ pub fn select(strategy: Strategy, candidates: &[Candidate], loop_id: &LoopId, se
                 }
             }
         }
-        Strategy::Local => order.sort_by_key(|&i| !candidates[i].here),
+        // Whom to ask is the ballot's; this host's own step costs no message.
+        Strategy::Local | Strategy::Vote(_) => order.sort_by_key(|&i| !candidates[i].here),
         Strategy::Shard => {
             let hosts: Vec<HostId> = order.iter().map(|&i| candidates[i].host.clone()).collect();
             let rank = place::rank(loop_id, &hosts);

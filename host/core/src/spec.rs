@@ -2,7 +2,7 @@
 //!
 //! Owns the checks that need nothing but the text itself; what needs a component or the points is checked at deployment.
 
-use std::collections::BTreeMap;
+use std::{borrow::Cow, collections::BTreeMap};
 
 use serde::{Deserialize, Serialize};
 
@@ -40,10 +40,12 @@ pub enum Strategy {
     Local,
     /// The same one for a loop, by rendezvous hash.
     Shard,
+    /// So many step each cycle, and what a majority of them gives to the last bit is taken; 2 to 16.
+    Vote(u8),
 }
 
 impl Strategy {
-    /// All of them, in the order in which they are documented.
+    /// Those that one replica steps under, in the order in which they are documented.
     pub const ALL: [Self; 7] = [
         Self::RoundRobin,
         Self::Random,
@@ -56,8 +58,8 @@ impl Strategy {
 
     /// The name used in configuration, API and command line.
     #[must_use]
-    pub const fn name(self) -> &'static str {
-        match self {
+    pub fn name(self) -> Cow<'static, str> {
+        Cow::Borrowed(match self {
             Self::RoundRobin => "round-robin",
             Self::Random => "random",
             Self::Cpu => "cpu",
@@ -65,16 +67,22 @@ impl Strategy {
             Self::P2c => "p2c",
             Self::Local => "local",
             Self::Shard => "shard",
-        }
+            Self::Vote(n) => return Cow::Owned(format!("vote({n})")),
+        })
     }
 }
 
 impl std::str::FromStr for Strategy {
     type Err = SpecError;
     fn from_str(text: &str) -> Result<Self, SpecError> {
+        let votes = text.strip_prefix("vote(").and_then(|rest| rest.strip_suffix(')'));
+        // `parse` would take a sign, and then two words would mean one strategy.
+        let votes = votes.filter(|digits| digits.bytes().all(|b| b.is_ascii_digit()));
+        let votes = votes.and_then(|digits| digits.parse().ok()).map(Self::Vote);
         Self::ALL
             .into_iter()
             .find(|s| s.name() == text)
+            .or(votes)
             .ok_or_else(|| SpecError::Strategy(text.chars().take(64).collect()))
     }
 }
@@ -138,6 +146,16 @@ pub enum OnBump {
     Alarm,
 }
 
+/// What a vote does where fewer replicas are left than it asks for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum OnFewer {
+    /// A majority of those that are left decides; the last one alone.
+    GoOn,
+    /// A majority of the number asked for is needed all the same; without it the cycle is a faulty one.
+    Fault,
+}
+
 /// The bounds within which the host runs the loop.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -163,6 +181,8 @@ pub struct Policy {
     /// Greatest difference of an output, in probation, from what the old component would send in the same cycle from the
     /// same state, in % of the output's span; more rolls back. None where the two may differ.
     pub probation_deviation_percent: Option<f64>,
+    /// Under `vote(n)`: what happens while fewer than n replicas are left.
+    pub on_fewer: OnFewer,
 }
 
 impl Default for Policy {
@@ -180,6 +200,7 @@ impl Default for Policy {
             on_bump: OnBump::Refuse,
             probation_cycles: 20,
             probation_deviation_percent: None,
+            on_fewer: OnFewer::GoOn,
         }
     }
 }
@@ -232,8 +253,20 @@ pub enum SpecError {
     #[error("replicas = {0}: 1 to {REPLICAS_MAX} are possible")]
     Replicas(u8),
     /// Not a strategy.
-    #[error("strategy {0:?} is unknown: use round-robin, random, cpu, latency, p2c, local or shard")]
+    #[error(
+        "strategy {0:?} is unknown: use round-robin, random, cpu, latency, p2c, local, shard or vote(n), as in vote(3)"
+    )]
     Strategy(String),
+    /// More votes than replicas, or a vote of one.
+    #[error(
+        "strategy vote({n}) with replicas = {replicas}: 2 to {REPLICAS_MAX} can vote, and no more than the loop has replicas"
+    )]
+    Vote {
+        /// Votes.
+        n: u8,
+        /// Replicas of the loop.
+        replicas: u8,
+    },
     /// Not a mode.
     #[error("mode {0:?} is unknown: use manual or automatic")]
     Mode(String),
@@ -283,6 +316,14 @@ impl LoopSpec {
         }
         if self.replicas == 0 || usize::from(self.replicas) > REPLICAS_MAX {
             return Err(SpecError::Replicas(self.replicas));
+        }
+        if let Strategy::Vote(n) = self.strategy
+            && (n < 2 || n > self.replicas)
+        {
+            return Err(SpecError::Vote {
+                n,
+                replicas: self.replicas,
+            });
         }
         let (low, high) = self.setpoint_range;
         let ordered = low.is_finite() && high.is_finite() && (low..=high).contains(&self.setpoint);
@@ -364,6 +405,55 @@ impl LoopSpec {
         match self.policy.step_limit_us {
             0 => (self.period_ns / 4).min(10_000_000),
             us => us * 1000,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "tests")]
+
+    use super::*;
+
+    #[test]
+    fn strategies_are_words_and_back() {
+        for strategy in Strategy::ALL.into_iter().chain([Strategy::Vote(2), Strategy::Vote(16)]) {
+            assert_eq!(strategy.name().parse::<Strategy>().unwrap(), strategy);
+        }
+        for bad in [
+            "vote",
+            "vote()",
+            "vote(x)",
+            "vote(+3)",
+            "vote(-1)",
+            "vote(3",
+            "vote(300)",
+            "vote( 3)",
+            "Vote(3)",
+            "",
+        ] {
+            let error = bad.parse::<Strategy>().unwrap_err().to_string();
+            assert!(error.contains("use round-robin"), "{bad}: {error}");
+        }
+    }
+
+    #[test]
+    fn a_vote_needs_that_many_replicas() {
+        for (n, replicas, good) in [
+            (3, 3, true),
+            (2, 3, true),
+            (4, 3, false),
+            (1, 3, false),
+            (0, 3, false),
+            (16, 16, true),
+        ] {
+            let spec = LoopSpec {
+                strategy: Strategy::Vote(n),
+                replicas,
+                ..crate::intent::test_spec()
+            };
+            let checked = spec.check();
+            assert_eq!(checked.is_ok(), good, "vote({n}) with {replicas}: {checked:?}");
         }
     }
 }

@@ -56,6 +56,11 @@ impl Feed {
         }
     }
 
+    /// A record that passed before holds an outcome that somebody waits for.
+    pub(crate) fn keep(&self, record: Arc<Record>, soon: bool) {
+        self.writer.keep(record, soon);
+    }
+
     /// Takes a record into the table only. Says whether it is the newest of its loop.
     pub(crate) fn remember(&self, record: &Arc<Record>) -> bool {
         let mut last = self.last.write();

@@ -46,6 +46,11 @@ pub trait Field: Send + Sync + 'static {
     /// # Errors
     /// The host is too busy.
     fn command(&self, id: &LoopId, command: Command, reply: CommandSink) -> Result<(), Error>;
+    /// A record of a loop at home here, at this position or a later one, is on this host's disk.
+    ///
+    /// # Errors
+    /// The host is too busy.
+    fn kept(&self, id: &LoopId, position: (u64, u64)) -> Result<(), Error>;
     /// Takes a command back that no cycle has begun with.
     ///
     /// # Errors
@@ -109,6 +114,9 @@ impl Field for Loops {
     }
     fn command(&self, id: &LoopId, command: Command, reply: CommandSink) -> Result<(), Error> {
         Self::command(self, id, command, reply)
+    }
+    fn kept(&self, id: &LoopId, position: (u64, u64)) -> Result<(), Error> {
+        Self::kept(self, id, position)
     }
     fn withdraw(&self, id: &LoopId, command: CommandId, reply: WithdrawSink) -> Result<(), Error> {
         Self::withdraw(self, id, command, reply)

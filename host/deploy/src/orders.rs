@@ -2,6 +2,7 @@
 //!
 //! ```text
 //! command ──► waits at the home ──rides in samples──► a record holds its outcome ──► done or refused
+//!                    │                                        and outlives the home: a member or the disk has it
 //!                    │ no cycle took it in time: taken back, and said so
 //!                    └ a slow loop: it waits on, and asking again with the same id tells its end
 //! ```

@@ -205,6 +205,8 @@ impl Room {
             version,
         };
         let (notices, arrived) = mpsc::channel(NOTICES_WAITING_MAX);
+        let told = Arc::clone(&field);
+        writer.tell_on_disk(Box::new(move |id, position| told.kept(id, position).is_ok()));
         let book = Book::open(store.clone())?;
         let library = Library::open(store.clone())?;
         let room = Arc::new(Self {
@@ -353,6 +355,7 @@ impl Room {
                 self.keep_cycle(&record);
                 self.feed.pass(record);
             }
+            DeployArrival::Loops(LoopsEvent::Outcome { record, alone }) => self.feed.keep(record, alone),
             DeployArrival::Bus(Arrival::Record(record)) => self.feed.pass(record),
             // The record with it has passed before, or does now; the reconciliation reads it from there.
             DeployArrival::Loops(LoopsEvent::Revised { loop_id, revision }) => {

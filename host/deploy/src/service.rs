@@ -118,6 +118,12 @@ impl Room {
 
     /// One step of a component for a caller from outside.
     pub(crate) async fn call(self: &Arc<Self>, call: Call) -> Result<CallEnd, Error> {
+        if let bumpless_core::Strategy::Vote(_) = call.strategy {
+            return Err(Error::invalid(
+                "a call is stepped by one replica, so there is nothing to vote on",
+                "choose another strategy",
+            ));
+        }
         let info = self.library.resolve(&call.component)?;
         let descriptor = &info.descriptor;
         let (frame, track) = frame(&call, descriptor, self.clock.now_ns())?;

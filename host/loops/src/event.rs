@@ -62,6 +62,14 @@ pub struct CallEnd {
 pub enum LoopsEvent {
     /// A home here took this record.
     Record(Arc<Record>),
+    /// The record before this event holds an outcome that somebody waits for: bring it to the disk, then call
+    /// [`crate::Loops::kept`].
+    Outcome {
+        /// The record.
+        record: Arc<Record>,
+        /// No other host holds the loop: the disk alone can keep the outcome, so it should be quick.
+        alone: bool,
+    },
     /// The record before was the first one of another revision.
     Revised {
         /// The loop.
@@ -108,6 +116,7 @@ pub(crate) enum Event {
     CloseHome(LoopId),
     Members(LoopId, Vec<HostId>),
     Command(LoopId, Box<Command>, ReplyToCommand),
+    Kept(LoopId, (u64, u64)),
     Withdraw(LoopId, CommandId, ReplyToWithdrawal),
     MoveTo(LoopId, HostId),
     Hold(Box<HeldRevision>),

@@ -5,6 +5,7 @@
 
 use std::{
     hash::{DefaultHasher, Hash, Hasher},
+    num::NonZeroU64,
     sync::{
         Arc, OnceLock,
         atomic::{AtomicI64, AtomicU64, Ordering},
@@ -25,6 +26,7 @@ use crate::{
     inbox::{self, Sender},
     replicas::Replicas,
     shared::Shared,
+    testing::FlipBits,
     wire::Wire,
     worker::Worker,
 };
@@ -39,6 +41,8 @@ const REAPER_MAX: usize = 4096;
 pub struct Config {
     /// Worker threads, 1 to 64. More than the processors keeps one misbehaving component from holding up the rest.
     pub workers: usize,
+    /// A test device: every so-manieth step of this host comes out with a bit turned over. None in service.
+    pub flip_bits_every: Option<NonZeroU64>,
 }
 
 impl Default for Config {
@@ -46,6 +50,7 @@ impl Default for Config {
         let processors = std::thread::available_parallelism().map_or(2, usize::from);
         Self {
             workers: (2 * processors).clamp(2, 16),
+            flip_bits_every: None,
         }
     }
 }
@@ -88,6 +93,7 @@ impl Loops {
             owned: AtomicI64::new(0),
             held: AtomicI64::new(0),
             dropped: AtomicU64::new(0),
+            flip_bits: config.flip_bits_every.map(FlipBits::new),
             inboxes: OnceLock::new(),
         });
         // Ends by itself when the last worker, and with it the last sender, is gone.
@@ -242,7 +248,7 @@ impl Loops {
     }
 
     /// Hands a command to the loop's home here. `reply` is called once, from the loop's worker, when a record holds the
-    /// outcome; it is dropped uncalled where the command was withdrawn or the host stops.
+    /// outcome and outlives this host: a member has it, or [`Loops::kept`] says that the disk has. It is dropped uncalled where the command was withdrawn or the host stops.
     pub fn command(
         &self,
         id: &LoopId,
@@ -250,6 +256,12 @@ impl Loops {
         reply: Box<dyn FnOnce(CommandReply) + Send>,
     ) -> Result<(), Error> {
         self.hand(id, Event::Command(id.clone(), Box::new(command), reply))
+    }
+
+    /// A record of a loop at home here, at this position or a later one, is on this host's disk: the outcomes up to it may be
+    /// told. Members tell of theirs by themselves.
+    pub fn kept(&self, id: &LoopId, position: (u64, u64)) -> Result<(), Error> {
+        self.hand(id, Event::Kept(id.clone(), position))
     }
 
     /// Takes a command back; `reply` says whether it was still waiting. False: it may take effect with the next record.

@@ -2,7 +2,8 @@
 //!
 //! ```text
 //! timer ─► deadline or overdue ─► Desk ─► sample ─► seat here, or wire
-//! commit ─► Desk::check ─► IoServer::write ─► Desk::take ─► record ─► wire, sink, waiting commands
+//! commit ─► Desk::check ─► IoServer::write ─► Desk::take ─► record ─► wire, sink
+//! a member has the record, or the disk ─► Desk::kept ─► waiting commands
 //! ```
 //! Outputs and record are taken together: a write that the I/O server refuses leaves no record.
 
@@ -229,6 +230,16 @@ impl Worker {
     pub(crate) fn answer(&mut self, answer: Answer) {
         match answer {
             Answer::Commit(record) => self.commit(*record),
+            Answer::Held {
+                loop_id,
+                term,
+                seq,
+                host,
+            } => {
+                if host != self.shared.here {
+                    self.acknowledge(&loop_id, (term, seq));
+                }
+            }
             Answer::NeedRecord { ref loop_id, .. } | Answer::Decline { ref loop_id, .. } => {
                 let id = loop_id.clone();
                 if let Answer::Decline { owner, reason, .. } = &answer {
@@ -290,15 +301,8 @@ impl Worker {
             let phase_ns = place::phase_ns(&id, spec.period_ns);
             home.desk.revise(now_ns, spec, phase_ns);
         }
-        for applied in &record.applied {
-            while let Some(i) = home.waiters.iter().position(|(waiting, _)| *waiting == applied.id) {
-                let (_, reply) = home.waiters.swap_remove(i);
-                reply(CommandReply::Applied {
-                    applied: applied.clone(),
-                    record: Arc::clone(&record),
-                });
-            }
-        }
+        let outcome = home.desk.unkept() == Some(record.position());
+        let alone = home.desk.members().iter().all(|host| *host == self.shared.here);
         home.publish_view();
         self.shared.wire.publish_record(&record);
         if revised {
@@ -308,12 +312,32 @@ impl Worker {
             });
         }
         (self.shared.sink)(LoopsEvent::Record(Arc::clone(&record)));
+        if outcome {
+            (self.shared.sink)(LoopsEvent::Outcome {
+                record: Arc::clone(&record),
+                alone,
+            });
+        }
         self.record(&record);
         self.deliver(&record);
         if !record.messages.is_empty() {
             self.shared.spread(self.index, &record);
         }
         self.schedule_home(&id);
+    }
+
+    /// Outcomes up to this position outlive this host: whoever waits for them is told.
+    pub(crate) fn acknowledge(&mut self, id: &LoopId, position: (u64, u64)) {
+        let Some(home) = self.homes.get_mut(id) else { return };
+        for (applied, record) in home.desk.kept(position) {
+            while let Some(i) = home.waiters.iter().position(|(waiting, _)| *waiting == applied.id) {
+                let (_, reply) = home.waiters.swap_remove(i);
+                reply(CommandReply::Applied {
+                    applied: applied.clone(),
+                    record: Arc::clone(&record),
+                });
+            }
+        }
     }
 
     /// Messages of a committed record, to the homes of this worker that listen.

@@ -13,7 +13,7 @@
 //!
 //! A loop lives on one worker of each host, chosen by its name, so nothing of a loop is shared between threads.
 //!
-//! Reading order: `handle` (what others may ask), `worker` (the thread), `home`, `seat`, `revise`, `calls`, then `replicas`, `wire`.
+//! Reading order: `handle` (what others may ask), `worker` (the thread), `home`, `seat`, `steps`, `vote`, `revise`, `calls`, then `replicas`, `wire`.
 
 mod calls;
 mod error;
@@ -25,6 +25,9 @@ mod replicas;
 mod revise;
 mod seat;
 mod shared;
+mod steps;
+mod testing;
+mod vote;
 mod wire;
 mod worker;
 

@@ -12,19 +12,22 @@
 //!                      ▼
 //!                    nobody left: in probation back to the old component in this same cycle, else the loop's policy
 //! ```
+//! Under `vote(n)` the attempts are a ballot: see `vote`.
 
 use std::{collections::VecDeque, sync::Arc};
 
 use crate::{
     event::HeldRevision,
     revise::{missing_input, take_over, track},
+    vote::{Late, redundancy},
     worker::{Timer, Worker},
 };
 use bumpless_core::{
-    Event as CycleEvent, Fault, Frame, HostId, LoopId, Reading, Record,
-    protocol::{Answer, Sample, StepAnswer, StepRequest},
+    Event as CycleEvent, Fault, Frame, HostId, LoopId, Reading, Record, Redundancy,
+    protocol::{Answer, Sample, StepAnswer},
     seat::{self, Ask, Attempts, Base, Conclusion, Standing, Stepped},
     select, swap,
+    vote::{Ballot, Judged},
 };
 
 /// Questions whose late answers still teach something about a replica's latency.
@@ -37,9 +40,9 @@ const HEDGE_NS_MIN: u64 = 1_500_000;
 const HEDGE_LATENCIES: u64 = 8;
 
 pub(crate) struct Asked {
-    correlation: u64,
-    host: HostId,
-    at_ns: u64,
+    pub(crate) correlation: u64,
+    pub(crate) host: HostId,
+    pub(crate) at_ns: u64,
 }
 
 /// A cycle on its way.
@@ -51,6 +54,10 @@ pub(crate) struct Running {
     pub(crate) standing: Standing,
     pub(crate) events: Vec<CycleEvent>,
     pub(crate) attempts: Attempts,
+    /// Instead of the attempts, where the strategy is a vote.
+    pub(crate) ballot: Option<Ballot>,
+    pub(crate) redundancy: Redundancy,
+    pub(crate) hedge_ns: u64,
     pub(crate) asked: Vec<Asked>,
     pub(crate) fault: Option<Fault>,
     pub(crate) started_ns: u64,
@@ -64,7 +71,11 @@ pub(crate) struct Seat {
     last: Option<Arc<Record>>,
     /// Our own commit that no record has confirmed yet.
     inflight: Option<Arc<Record>>,
-    running: Option<Running>,
+    pub(crate) running: Option<Running>,
+    /// What the latest vote decided, for answers that come after it.
+    pub(crate) late: Option<Late>,
+    /// Answers that were judged after their cycle; they count in the next one. At most [`JUDGED_MAX`].
+    pub(crate) judged: Vec<Judged>,
     /// A step here or for us that ran past its limit: revision, the record that it went on from, and the fault.
     overran: Option<(u64, (u64, u64), Fault)>,
     recent: VecDeque<Asked>,
@@ -72,7 +83,7 @@ pub(crate) struct Seat {
 }
 
 impl Seat {
-    fn held(&mut self, revision: u64) -> Option<&mut HeldRevision> {
+    pub(crate) fn held(&mut self, revision: u64) -> Option<&mut HeldRevision> {
         self.held.iter_mut().find(|h| h.spec.revision == revision)
     }
 
@@ -170,6 +181,20 @@ impl Worker {
     }
 
     pub(crate) fn remote_record(&mut self, record: &Arc<Record>) {
+        // A member that sees an outcome for the first time says so: from now on the outcome outlives its home.
+        let news = self
+            .seats
+            .get(&record.loop_id)
+            .is_some_and(|seat| record.has_news_for(seat.last.as_deref()));
+        if news && record.home != self.shared.here {
+            let answer = Answer::Held {
+                loop_id: record.loop_id.clone(),
+                term: record.term,
+                seq: record.seq,
+                host: self.shared.here.clone(),
+            };
+            self.shared.wire.send_answer(&record.home, &answer);
+        }
         self.record(record);
         self.deliver(record);
     }
@@ -265,17 +290,20 @@ impl Worker {
         let left_ns = sample.left_ns;
         let here_at_ns = started_ns + (left_ns as f64 * HERE_PART) as u64;
         let hedge_ns = (held.spec.period_ns as f64 * held.spec.policy.hedge_part) as u64;
-        let (strategy, digest, period_seq) = (held.spec.strategy, held.spec.digest, sample.seq);
+        let (spec, digest, seq) = (Arc::clone(&held.spec), held.spec.digest, sample.seq);
+        let here = self.shared.here.clone();
+        let candidates = self
+            .shared
+            .replicas
+            .candidates(&sample.members, &here, &digest, started_ns);
+        let mut ballot = None;
+        let redundancy = redundancy(&spec, &candidates, &here, base.as_deref(), &mut ballot);
         // A fault that is known already needs no replica; neither does a change of revision, which steps both here.
         let order = if fault.is_some() || standing.revise.is_some() {
             Vec::new()
         } else {
-            let candidates = self
-                .shared
-                .replicas
-                .candidates(&sample.members, &self.shared.here, &digest, started_ns);
             let random = self.random();
-            select::select(strategy, &candidates, &id, period_seq, random)
+            select::select(spec.strategy, &candidates, &id, seq, random)
                 .into_iter()
                 .filter_map(|i| candidates.get(i))
                 .map(|c| (c.host.clone(), c.latency_ns))
@@ -288,7 +316,10 @@ impl Worker {
         let hedge_ns = hedge_ns.min(usual_ns.max(HEDGE_NS_MIN));
         let order = order.into_iter().map(|(host, _)| host);
         let running = Running {
-            attempts: Attempts::new(order, self.shared.here.clone(), hedge_ns, here_at_ns),
+            attempts: Attempts::new(order, here, hedge_ns, here_at_ns),
+            ballot: None,
+            redundancy,
+            hedge_ns,
             state: state.unwrap_or_else(|_| Arc::from([])),
             sample,
             base,
@@ -306,7 +337,10 @@ impl Worker {
             (_, Some(fault)) if bad_input.is_some() => self.conclude(&id, running, Err(fault)),
             (Some((command, revision)), fault) => self.revise(&id, running, command, revision, fault),
             (None, Some(fault)) => self.without_a_step(&id, running, fault),
-            (None, None) => self.advance(&id, running),
+            (None, None) => match ballot {
+                Some(ballot) => self.open_ballot(&id, running, ballot),
+                None => self.advance(&id, running),
+            },
         }
     }
 
@@ -316,38 +350,18 @@ impl Worker {
             let now_ns = self.shared.now_ns();
             match running.attempts.next(now_ns) {
                 Ask::Remote(host, until_ns) => {
-                    let Some(seat) = self.seats.get(id) else { return };
-                    let Some(held) = seat.held.iter().find(|h| h.spec.revision == running.sample.revision) else {
+                    let Some(mut request) = self.request(id, &running) else {
                         return;
                     };
-                    let (digest, limit_ns) = (held.spec.digest, held.spec.step_limit_ns());
-                    let correlation = self.correlation();
-                    let request = StepRequest {
-                        from: self.shared.here.clone(),
-                        correlation,
-                        loop_id: id.clone(),
-                        digest,
-                        limit_ns,
-                        frame: running.frame.clone(),
-                        state: Arc::clone(&running.state),
-                    };
-                    self.shared.wire.send_step(&host, &request);
-                    running.asked.push(Asked {
-                        correlation,
-                        host,
-                        at_ns: now_ns,
-                    });
+                    self.ask(&mut running, &mut request, host, now_ns);
                     return self.wait(id, running, until_ns);
                 }
                 Ask::Here => {
-                    let Some(held) = self.seats.get_mut(id).and_then(|s| s.held(running.sample.revision)) else {
+                    let Some((step, step_ns)) = self.step_here(id, &running) else {
                         return;
                     };
-                    let limit_ns = held.spec.step_limit_ns();
-                    let began_ns = self.shared.now_ns();
-                    match held.instance.step(&running.frame, &running.state, limit_ns) {
+                    match step {
                         Ok(effects) => {
-                            let step_ns = self.shared.now_ns() - began_ns;
                             let by = self.shared.here.clone();
                             return self.conclude(id, running, Ok(Stepped { effects, by, step_ns }));
                         }
@@ -379,7 +393,7 @@ impl Worker {
         }
     }
 
-    fn wait(&mut self, id: &LoopId, mut running: Running, until_ns: u64) {
+    pub(crate) fn wait(&mut self, id: &LoopId, mut running: Running, until_ns: u64) {
         running.next_at_ns = until_ns;
         let Some(seat) = self.seats.get_mut(id) else { return };
         seat.running = Some(running);
@@ -392,6 +406,9 @@ impl Worker {
         let Some(mut running) = seat.running.take_if(|r| r.next_at_ns == at_ns) else {
             return;
         };
+        if running.ballot.is_some() {
+            return self.ballot_due(id, running, now_ns);
+        }
         if let Some(asked) = running.asked.last() {
             self.shared
                 .replicas
@@ -407,6 +424,9 @@ impl Worker {
     pub(crate) fn replica_lost(&mut self, id: &LoopId, host: &HostId, _now_ns: u64) {
         let Some(seat) = self.seats.get_mut(id) else { return };
         let Some(mut running) = seat.running.take() else { return };
+        if running.ballot.is_some() {
+            return self.voter_lost(id, running, host);
+        }
         let latest = running.asked.last().is_some_and(|a| a.host == *host);
         running.asked.retain(|a| a.host != *host);
         if latest {
@@ -432,6 +452,7 @@ impl Worker {
                 self.shared
                     .replicas
                     .answered(&asked.host, now_ns.saturating_sub(asked.at_ns));
+                seat.judge_late(&asked, answer.result);
             }
             return;
         };
@@ -440,6 +461,10 @@ impl Worker {
         };
         let asked = running.asked.remove(i);
         let latency_ns = now_ns.saturating_sub(asked.at_ns);
+        if running.ballot.is_some() {
+            self.shared.replicas.answered(&asked.host, latency_ns);
+            return self.voted(&id, running, &asked.host, answer.result);
+        }
         match answer.result {
             Ok(effects) => {
                 self.shared.replicas.answered(&asked.host, latency_ns);
@@ -469,43 +494,6 @@ impl Worker {
                 self.advance(&id, running);
             }
         }
-    }
-
-    /// A step for another host.
-    pub(crate) fn step_request(&mut self, request: StepRequest) {
-        let StepRequest {
-            from,
-            correlation,
-            loop_id,
-            digest,
-            limit_ns,
-            frame,
-            state,
-        } = request;
-        let began_ns = self.shared.now_ns();
-        let here = self.shared.here.clone();
-        let not_ready = |reason: &str| Fault::NotReady {
-            host: here.to_string(),
-            reason: reason.to_owned(),
-        };
-        let held = self
-            .seats
-            .get_mut(&loop_id)
-            .and_then(|s| s.held.iter_mut().find(|h| h.spec.digest == digest));
-        let result = match held {
-            Some(held) => held.instance.step(&frame, &state, limit_ns),
-            None if crate::calls::is_call(&loop_id) => self.step_for_call(&digest, &frame, &state, limit_ns),
-            None => Err(not_ready("the loop is not held here")),
-        };
-        let step_ns = self.shared.now_ns() - began_ns;
-        let answer = StepAnswer {
-            from: self.shared.here.clone(),
-            correlation,
-            loop_id,
-            result,
-            step_ns,
-        };
-        self.shared.wire.send_step_answer(&from, &answer);
     }
 
     /// Ends the cycle under the revision in force.
@@ -561,6 +549,7 @@ impl Worker {
             standing: running.standing,
             events: running.events,
             probation,
+            redundancy: running.redundancy,
             step,
             cycle_ns: now_ns.saturating_sub(running.started_ns),
         });

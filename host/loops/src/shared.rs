@@ -5,7 +5,7 @@ use std::sync::{
     atomic::{AtomicI64, AtomicU64, Ordering},
 };
 
-use bumpless_core::{HostId, Record};
+use bumpless_core::{Effects, Fault, HostId, Record};
 use bumpless_engine::{Engine, Instance};
 use bumpless_io::{Clock, IoServer};
 
@@ -13,6 +13,7 @@ use crate::{
     event::{Event, LoopsEvent},
     inbox::Sender,
     replicas::Replicas,
+    testing::FlipBits,
     wire::Wire,
 };
 
@@ -32,6 +33,8 @@ pub(crate) struct Shared {
     pub(crate) owned: AtomicI64,
     pub(crate) held: AtomicI64,
     pub(crate) dropped: AtomicU64,
+    /// A test device; none in service.
+    pub(crate) flip_bits: Option<FlipBits>,
     /// The workers' inboxes, for messages from a loop on one worker to a home on another.
     pub(crate) inboxes: OnceLock<Vec<Sender<Event>>>,
 }
@@ -39,6 +42,13 @@ pub(crate) struct Shared {
 impl Shared {
     pub(crate) fn now_ns(&self) -> u64 {
         self.clock.now_ns()
+    }
+
+    /// A step of this host came to this: where it is a test host, some come out wrong.
+    pub(crate) fn disturb(&self, step: &mut Result<Effects, Fault>) {
+        if let Some(device) = &self.flip_bits {
+            device.disturb(step);
+        }
     }
 
     /// Drops an instance elsewhere. Where the reaper's queue is full, here: memory matters more then.

@@ -162,6 +162,7 @@ impl Worker {
             Event::CloseHome(id) => self.close_home(&id),
             Event::Members(id, members) => self.members(&id, members),
             Event::Command(id, command, reply) => self.command(&id, *command, reply),
+            Event::Kept(id, position) => self.acknowledge(&id, position),
             Event::Withdraw(id, command, reply) => reply(self.homes.get_mut(&id).is_some_and(|h| h.withdraw(command))),
             Event::MoveTo(id, host) => {
                 if let Some(home) = self.homes.get_mut(&id) {

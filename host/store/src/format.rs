@@ -9,7 +9,7 @@ use serde::{Serialize, de::DeserializeOwned};
 use crate::error::Error;
 
 /// Version of every row that is written now.
-pub(crate) const ROW_VERSION: u8 = 2;
+pub(crate) const ROW_VERSION: u8 = 3;
 
 /// Bytes of one row at most. The largest is a record: 64 KiB of state and some tens of messages of 4 KiB.
 pub(crate) const ROW_BYTES_MAX: usize = 1024 * 1024;

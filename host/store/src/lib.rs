@@ -38,7 +38,7 @@ pub use cycles::{BYTES_MAX as CYCLE_BYTES_MAX, Cursor, CycleCounts, CycleLog, Wi
 pub use error::Error;
 pub use intents::Tombstone;
 pub use store::{FORMAT, Store};
-pub use writer::{RecordWriter, WriterCounts};
+pub use writer::{OnDisk, RecordWriter, WriterCounts};
 
 #[cfg(test)]
 mod tests;

@@ -9,12 +9,15 @@
 //!                └──────the write failed───────┘   (unless a newer one waits already)
 //! ```
 //!
+//! Where somebody waits for a record to be on the disk ([`RecordWriter::keep`]), whoever was named with
+//! [`RecordWriter::tell_on_disk`] hears of it after the sync, at once where it is asked for.
+//!
 //! A full map (more loops than a host can run) refuses new loops and counts them; a loop that is in it is always taken.
 
 use std::{
     collections::HashMap,
     sync::{
-        Arc, Mutex, MutexGuard, PoisonError,
+        Arc, Mutex, MutexGuard, OnceLock, PoisonError,
         atomic::{AtomicU64, Ordering},
         mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel},
     },
@@ -46,6 +49,12 @@ const REQUESTS_MAX: usize = 16;
 
 type Waiting = HashMap<LoopId, Arc<Record>>;
 
+/// Positions, (term, seq), that somebody waits for: the greatest of each loop.
+type Asked = HashMap<LoopId, (u64, u64)>;
+
+/// Takes the news that a loop's record up to a position is on the disk; false where it has no room for it now.
+pub type OnDisk = Box<dyn Fn(&LoopId, (u64, u64)) -> bool + Send + Sync>;
+
 /// What a writer did so far.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct WriterCounts {
@@ -70,19 +79,44 @@ struct Counters {
     failed_writes: AtomicU64,
 }
 
-#[derive(Debug, Default)]
+#[derive(Default)]
 struct Shared {
     waiting: Mutex<Waiting>,
+    asked: Mutex<Asked>,
+    on_disk: OnceLock<OnDisk>,
     counters: Counters,
+}
+
+impl std::fmt::Debug for Shared {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Shared")
+            .field("counters", &self.counters)
+            .finish_non_exhaustive()
+    }
 }
 
 impl Shared {
     fn waiting(&self) -> MutexGuard<'_, Waiting> {
         self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
     }
+
+    fn asked(&self) -> MutexGuard<'_, Asked> {
+        self.asked.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Notes positions that are waited for.
+    fn ask(&self, positions: impl IntoIterator<Item = (LoopId, (u64, u64))>) {
+        let mut asked = self.asked();
+        for (loop_id, position) in positions {
+            let held = asked.entry(loop_id).or_default();
+            *held = position.max(*held);
+        }
+    }
 }
 
 enum Request {
+    /// Bring everything to the disk soon; whoever asked hears of it by itself.
+    Sync,
     /// Bring everything to the disk and say how it went.
     Flush(SyncSender<Result<(), Error>>),
     /// The same, and end.
@@ -129,7 +163,33 @@ impl RecordWriter {
     /// Takes a record to be written. Never waits for the disk: it holds a lock for one look into a map, and so does the
     /// thread. A record that is older than the one waiting is passed over.
     pub fn offer(&self, record: Arc<Record>) {
+        self.take_in(record);
+    }
+
+    /// Names who is told of records that were asked for with [`RecordWriter::keep`]. Called once; a second one changes nothing.
+    pub fn tell_on_disk(&self, on_disk: OnDisk) {
+        drop(self.shared.on_disk.set(on_disk));
+    }
+
+    /// As [`RecordWriter::offer`], and tells when this record, or a later one of its loop, is on the disk: after the next sync,
+    /// which is made at once where `soon` is set. A record that is refused is never told of.
+    pub fn keep(&self, record: Arc<Record>, soon: bool) {
+        let asked = (record.loop_id.clone(), record.position());
+        if !self.take_in(record) {
+            return;
+        }
+        // After it waits to be written, so that a sync that takes the question takes the record too.
+        self.shared.ask([asked]);
+        if soon {
+            // A full queue holds syncs already.
+            drop(self.requests.try_send(Request::Sync));
+        }
+    }
+
+    /// Says whether the record, or a newer one of its loop, waits to be written.
+    fn take_in(&self, record: Arc<Record>) -> bool {
         let counters = &self.shared.counters;
+        let loop_id = &record.loop_id.clone();
         counters.offered.fetch_add(1, Ordering::Relaxed);
         let mut waiting = self.shared.waiting();
         let room = waiting.len() < LOOPS_MAX;
@@ -145,15 +205,18 @@ impl RecordWriter {
             }
             None => (Some(&counters.refused), Some(record)),
         };
+        let taken = waiting.contains_key(loop_id);
         drop(waiting);
         if let Some(counter) = counter {
             counter.fetch_add(1, Ordering::Relaxed);
         }
         drop(left_over);
+        taken
     }
 
     /// Drops what waits for a loop that was removed.
     pub fn forget(&self, loop_id: &LoopId) {
+        self.shared.asked().remove(loop_id);
         let left_over = self.shared.waiting().remove(loop_id);
         drop(left_over);
     }
@@ -242,6 +305,11 @@ impl Worker {
                         self.complain(&error);
                     }
                 }
+                Ok(Request::Sync) => {
+                    if let Err(error) = self.write(true) {
+                        self.complain(&error);
+                    }
+                }
                 Ok(Request::Flush(answer)) => {
                     // Nobody may be waiting any more; the records are written either way.
                     let _ = answer.try_send(self.write(true));
@@ -262,6 +330,12 @@ impl Worker {
     }
 
     fn write(&mut self, sync: bool) -> Result<(), Error> {
+        // Before the records are taken: what is asked for then is among them, or was written before.
+        let asked = if sync {
+            std::mem::take(&mut *self.shared.asked())
+        } else {
+            Asked::new()
+        };
         std::mem::swap(&mut *self.shared.waiting(), &mut self.batch);
         let records: Vec<Arc<Record>> = self.batch.drain().map(|(_, record)| record).collect();
         let written = self.store.put_records(&records);
@@ -277,18 +351,36 @@ impl Worker {
         let due = sync && !self.unsynced.is_empty();
         let result = written.and_then(|()| if due { self.store.sync() } else { Ok(()) });
         match &result {
-            Ok(()) if due => {
-                self.unsynced.clear();
-                self.synced_at = Instant::now();
+            Ok(()) => {
+                if due {
+                    self.unsynced.clear();
+                    self.synced_at = Instant::now();
+                }
+                self.tell(asked);
             }
-            Ok(()) => {}
             // What only the store's memory held may be gone with it.
             Err(_) => {
                 self.put_back();
+                self.shared.ask(asked);
                 self.shared.counters.failed_writes.fetch_add(1, Ordering::Relaxed);
             }
         }
         result
+    }
+
+    /// Everything up to here is on the disk: whoever asked is told, as far as it can be read there. A record that was passed
+    /// over, being too large or of a loop that was removed, is not there and not told of.
+    fn tell(&self, asked: Asked) {
+        let Some(on_disk) = self.shared.on_disk.get() else {
+            return;
+        };
+        for (loop_id, position) in asked {
+            let there = self.store.last_record(&loop_id).ok().flatten();
+            let there = there.is_some_and(|record| record.position() >= position);
+            if there && !on_disk(&loop_id, position) {
+                self.shared.ask([(loop_id, position)]);
+            }
+        }
     }
 
     fn put_back(&mut self) {

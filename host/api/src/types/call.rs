@@ -9,7 +9,7 @@ use utoipa::ToSchema;
 use super::{Mode, Strategy, finite, from_base64, ms, to_base64, us};
 
 const fn round_robin() -> Strategy {
-    Strategy::RoundRobin
+    Strategy(bumpless_core::Strategy::RoundRobin)
 }
 
 const fn automatic() -> Mode {

@@ -7,7 +7,7 @@ use bumpless_deploy as deploy;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-use super::{Mode, OnBump, OnFault, PortTable, Record, Strategy, finite, ms};
+use super::{Mode, OnBump, OnFault, OnFewer, PortTable, Record, Redundancy, Strategy, finite, ms};
 
 const fn three() -> u8 {
     3
@@ -18,7 +18,7 @@ const fn automatic() -> Mode {
 }
 
 const fn round_robin() -> Strategy {
-    Strategy::RoundRobin
+    Strategy(bumpless_core::Strategy::RoundRobin)
 }
 
 /// A loop as people write it: the body of `PUT`, and a loop file in TOML.
@@ -109,6 +109,8 @@ pub struct Policy {
     /// state, in % of the output's span; more rolls back. None where the two may differ.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub probation_deviation_percent: Option<f64>,
+    /// Under `vote(n)`: what happens while fewer than n replicas are left.
+    pub on_fewer: OnFewer,
 }
 
 impl Default for Policy {
@@ -130,6 +132,7 @@ impl From<model::Policy> for Policy {
             on_bump: policy.on_bump.into(),
             probation_cycles: policy.probation_cycles,
             probation_deviation_percent: policy.probation_deviation_percent,
+            on_fewer: policy.on_fewer.into(),
         }
     }
 }
@@ -147,6 +150,7 @@ impl From<Policy> for model::Policy {
             on_bump: policy.on_bump.into(),
             probation_cycles: policy.probation_cycles,
             probation_deviation_percent: policy.probation_deviation_percent,
+            on_fewer: policy.on_fewer.into(),
         }
     }
 }
@@ -235,6 +239,9 @@ pub struct Loop {
     pub term: Option<u64>,
     /// Number of the last cycle.
     pub seq: Option<u64>,
+    /// What the last cycle could count on.
+    #[serde(default)]
+    pub redundancy: Option<Redundancy>,
     /// Mode in force.
     pub mode: Option<Mode>,
     /// Setpoint in force.
@@ -316,6 +323,7 @@ impl Loop {
             owner: last.as_ref().map(|r| r.owner.clone()),
             term: last.as_ref().map(|r| r.term),
             seq: last.as_ref().map(|r| r.seq),
+            redundancy: last.as_ref().map(|r| r.redundancy.clone()),
             mode: last.as_ref().map(|r| r.mode),
             setpoint: last.as_ref().and_then(|r| r.setpoint),
             measured_port: ports.measured.and_then(|port| ports.names.get(port).cloned()),

@@ -100,6 +100,9 @@ pub struct Record {
     pub faults_in_row: u32,
     /// While a swap is on probation: the cycles left.
     pub probation_cycles_left: Option<u32>,
+    /// What the cycle could count on.
+    #[serde(default)]
+    pub redundancy: Redundancy,
     /// Outcomes of the latest commands, oldest first.
     pub applied: Vec<Applied>,
     /// What the cycle met.
@@ -142,6 +145,67 @@ pub struct Applied {
     pub command_id: String,
     /// Why it was refused; none where it is in force.
     pub refused: Option<String>,
+}
+
+/// How many replicas a cycle could count on.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
+pub struct Redundancy {
+    /// Replicas that could step, the owner among them; under a vote, those with a vote.
+    pub have: u8,
+    /// Replicas that the loop asks for; under a vote, the number of votes.
+    pub want: u8,
+    /// How the vote stands; none where the strategy is another.
+    pub vote: Option<Vote>,
+}
+
+/// How a vote stands.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct Vote {
+    /// Answers that counted in the cycle; 0 where it was not voted on.
+    pub answers: u8,
+    /// Of these, equal to the one that was taken.
+    pub agreed: u8,
+    /// Equal answers that were needed.
+    pub needed: u8,
+    /// Answers against a majority since the loop began.
+    pub dissents: u64,
+    /// Replicas that step along without a vote.
+    pub aside: Vec<Aside>,
+}
+
+/// A replica without a vote.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct Aside {
+    /// The host.
+    pub host: String,
+    /// Steps in a row that agreed with the majority.
+    pub clean: u32,
+    /// Steps in a row that give it its vote back.
+    pub clean_needed: u32,
+    /// Answers against a majority since it was set aside.
+    pub dissents: u32,
+}
+
+impl From<&model::Redundancy> for Redundancy {
+    fn from(redundancy: &model::Redundancy) -> Self {
+        let aside = |a: &model::redundancy::Aside| Aside {
+            host: a.host.to_string(),
+            clean: a.clean,
+            clean_needed: model::vote::CLEAN_STEPS,
+            dissents: a.dissents,
+        };
+        Self {
+            have: redundancy.have,
+            want: redundancy.want,
+            vote: redundancy.vote.as_ref().map(|vote| Vote {
+                answers: vote.answers,
+                agreed: vote.agreed,
+                needed: vote.needed,
+                dissents: vote.dissents,
+                aside: vote.aside.iter().map(aside).collect(),
+            }),
+        }
+    }
 }
 
 /// Something that a cycle met and that people should hear of.
@@ -201,6 +265,37 @@ pub enum Event {
     BadInput {
         /// The port.
         port: String,
+    },
+    /// Fewer replicas than the loop asks for can step now, and fewer than before.
+    RedundancyLost {
+        /// Those that can, the owner among them.
+        have: u8,
+        /// Those that the loop asks for.
+        want: u8,
+    },
+    /// As many replicas as the loop asks for can step again.
+    RedundancyRestored {
+        /// Those that the loop asks for.
+        want: u8,
+    },
+    /// A replica's step was not what the majority's was, to the last bit: it has no vote until further notice.
+    Dissent {
+        /// The replica.
+        replica: String,
+    },
+    /// A replica without a vote agreed often enough to have one again.
+    Readmitted {
+        /// The replica.
+        replica: String,
+    },
+    /// Too few equal answers came in time; the cycle is a faulty one.
+    NoMajority {
+        /// Answers that came.
+        answers: u8,
+        /// Of these, the most that were equal.
+        agreed: u8,
+        /// Equal answers that were needed.
+        needed: u8,
     },
 }
 
@@ -271,6 +366,7 @@ impl Record {
             state_bytes: record.state.len() as u64,
             faults_in_row: record.faults_in_row,
             probation_cycles_left: record.probation.map(|(_, cycles)| cycles),
+            redundancy: (&record.redundancy).into(),
             applied: record.applied.iter().map(Into::into).collect(),
             events: record.events.iter().map(|event| Event::new(event, ports)).collect(),
             alarms: record
@@ -359,6 +455,26 @@ impl Event {
             },
             model::Event::BadInput(port) => Self::BadInput {
                 port: ports.name(usize::from(*port)),
+            },
+            model::Event::RedundancyLost { have, want } => Self::RedundancyLost {
+                have: *have,
+                want: *want,
+            },
+            model::Event::RedundancyRestored { want } => Self::RedundancyRestored { want: *want },
+            model::Event::Dissent { replica } => Self::Dissent {
+                replica: replica.to_string(),
+            },
+            model::Event::Readmitted { replica } => Self::Readmitted {
+                replica: replica.to_string(),
+            },
+            model::Event::NoMajority {
+                answers,
+                agreed,
+                needed,
+            } => Self::NoMajority {
+                answers: *answers,
+                agreed: *agreed,
+                needed: *needed,
             },
         }
     }

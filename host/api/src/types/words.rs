@@ -1,8 +1,16 @@
 //! The closed lists of words, each with its way from and to the model.
 
+use std::borrow::Cow;
+
 use bumpless_core as model;
-use serde::{Deserialize, Serialize};
-use utoipa::ToSchema;
+use serde::{Deserialize, Deserializer, Serialize, Serializer, de::Error as _};
+use utoipa::{
+    PartialSchema, ToSchema,
+    openapi::{
+        RefOr,
+        schema::{ObjectBuilder, Schema, Type},
+    },
+};
 
 /// A closed list with the same words in the model.
 macro_rules! words {
@@ -42,23 +50,63 @@ words! {
     }
 }
 
+/// How the replica that steps is chosen: a word, or `vote(n)`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct Strategy(pub model::Strategy);
+
+impl From<model::Strategy> for Strategy {
+    fn from(strategy: model::Strategy) -> Self {
+        Self(strategy)
+    }
+}
+
+impl From<Strategy> for model::Strategy {
+    fn from(strategy: Strategy) -> Self {
+        strategy.0
+    }
+}
+
+impl Serialize for Strategy {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_str(&self.name())
+    }
+}
+
+impl<'de> Deserialize<'de> for Strategy {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let text = Cow::<str>::deserialize(deserializer)?;
+        text.parse().map(Self).map_err(D::Error::custom)
+    }
+}
+
+impl PartialSchema for Strategy {
+    fn schema() -> RefOr<Schema> {
+        let words: Vec<Cow<'static, str>> = model::Strategy::ALL.into_iter().map(model::Strategy::name).collect();
+        ObjectBuilder::new()
+            .schema_type(Type::String)
+            .pattern(Some(format!("^({}|vote\\([0-9]+\\))$", words.join("|"))))
+            .description(Some(
+                "How the replica that steps is chosen: each in turn, any, the least loaded, the nearest, two at random of which \
+                 the better, the owner itself, the same one for a loop; or vote(n), where n replicas step each cycle and what a \
+                 majority gives to the last bit is taken.",
+            ))
+            .into()
+    }
+}
+
+impl ToSchema for Strategy {
+    fn name() -> Cow<'static, str> {
+        Cow::Borrowed("Strategy")
+    }
+}
+
 words! {
-    /// How the replica that steps is chosen.
-    Strategy = model::Strategy {
-        /// Each in turn, by cycle number.
-        RoundRobin,
-        /// Any, evenly.
-        Random,
-        /// The least loaded processor.
-        Cpu,
-        /// The shortest smoothed latency.
-        Latency,
-        /// Two at random, the better by latency times load.
-        P2c,
-        /// The owner itself.
-        Local,
-        /// The same one for a loop, by rendezvous hash.
-        Shard,
+    /// What a vote does where fewer replicas are left than it asks for.
+    OnFewer = model::OnFewer {
+        /// A majority of those that are left decides; the last one alone.
+        GoOn,
+        /// A majority of the number asked for is needed all the same; without it the cycle is a faulty one.
+        Fault,
     }
 }
 
@@ -153,8 +201,8 @@ impl Mode {
 impl Strategy {
     /// The word as JSON has it.
     #[must_use]
-    pub fn name(self) -> &'static str {
-        model::Strategy::from(self).name()
+    pub fn name(self) -> Cow<'static, str> {
+        self.0.name()
     }
 }
 

@@ -313,7 +313,7 @@ fn list(client: &Client, json: bool) -> Result<(), Error> {
             outputs.join(", "),
             l.owner.unwrap_or_else(|| "–".to_owned()),
             l.term.map_or_else(|| "–".to_owned(), |term| term.to_string()),
-            l.spec.strategy.name().to_owned(),
+            l.spec.strategy.name().into_owned(),
             l.last_age_ms.map_or_else(|| "–".to_owned(), show::age),
         ]);
     }
@@ -381,6 +381,30 @@ fn show_one(client: &Client, json: bool, name: &str) -> Result<(), Error> {
         "strategy",
         format!("{} over {}", l.spec.strategy.name(), l.members.join(", ")),
     );
+    if let Some(redundancy) = &l.redundancy {
+        row(
+            "replicas",
+            format!("{} of {} can step", redundancy.have, redundancy.want),
+        );
+        if let Some(vote) = &redundancy.vote {
+            row(
+                "vote",
+                format!(
+                    "{} of {} answers agreed, {} needed; {} dissents so far",
+                    vote.agreed, vote.answers, vote.needed, vote.dissents
+                ),
+            );
+            for a in &vote.aside {
+                row(
+                    "without a vote",
+                    format!(
+                        "{}: {} of {} clean steps, {} dissents",
+                        a.host, a.clean, a.clean_needed, a.dissents
+                    ),
+                );
+            }
+        }
+    }
     row("home", l.home.clone());
     row(
         "owner",
@@ -467,7 +491,7 @@ mod tests {
             (good.replace("= 100", "= \"fast\""), ["line 3, key period_ms", "f64"]),
             (
                 format!("strategy = \"best\"\n{good}"),
-                ["line 1, key strategy", "`round-robin`"],
+                ["line 1, key strategy", "use round-robin"],
             ),
             (good.replace("name = \"l\"", ""), ["l.toml", "missing field `name`"]),
         ] {

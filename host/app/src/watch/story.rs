@@ -74,7 +74,7 @@ impl Story {
             component: found.component.clone(),
             unit: found.measured_unit.clone().unwrap_or_default(),
             period_ms: found.spec.period_ms,
-            strategy: found.spec.strategy.name().to_owned(),
+            strategy: found.spec.strategy.name().into_owned(),
             home: found.home.clone(),
             members: found.members.clone(),
             samples: VecDeque::new(),
@@ -284,6 +284,17 @@ fn in_words(event: &Event, record: &Record) -> Option<String> {
         ),
         Event::RolledBack { from, reason } => format!("rolled back from revision {from}: {reason}"),
         Event::BadInput { port } => format!("input {port} is bad"),
+        Event::RedundancyLost { have, want } => format!("redundancy lost: {have} of {want} replicas can step"),
+        Event::RedundancyRestored { want } => format!("all {want} replicas can step again"),
+        Event::Dissent { replica } => {
+            format!("dissent: {replica} stepped otherwise than the majority, and has no vote now")
+        }
+        Event::Readmitted { replica } => format!("{replica} agreed often enough to vote again"),
+        Event::NoMajority {
+            answers,
+            agreed,
+            needed,
+        } => format!("no majority: {agreed} of {answers} answers agree, {needed} are needed"),
         Event::Limited { .. } => return None,
     })
 }

@@ -128,7 +128,7 @@ fn other_versions_and_huge_messages_say_so() {
     bytes[0] = VERSION + 1;
     let error = decode::<Token>(&bytes).unwrap_err().to_string();
     assert!(
-        error.contains("wire version 2") && error.contains("speaks version 1"),
+        error.contains("wire version 3") && error.contains("speaks version 2"),
         "{error}"
     );
     let error = decode::<Record>(&vec![VERSION; CYCLE_BYTES_MAX + 1])

@@ -5,6 +5,7 @@
 use std::sync::Arc;
 
 use bumpless_cell::{Roles, Vitals};
+use bumpless_core::redundancy::{Aside, Redundancy, Standing};
 use bumpless_core::{
     AlarmChange, Applied, Command, CommandBody, CommandId, Cycle, Digest, Effects, Event, Fault, Frame, HostId,
     LogLevel, LogLine, LoopId, Message, Mode, NoData, Outcome, Priority, Reading, Record,
@@ -65,6 +66,7 @@ pub(crate) fn record(owner: &HostId, seq: u64, state: Vec<u8>) -> Record {
         after: (3, seq.saturating_sub(1)),
         revision: 5,
         digest: Digest::of(b"pid"),
+        home: host("io"),
         owner: owner.clone(),
         stepped_by: host("other"),
         at_ns: 11,
@@ -79,6 +81,21 @@ pub(crate) fn record(owner: &HostId, seq: u64, state: Vec<u8>) -> Record {
         state: Arc::from(state),
         faults_in_row: 2,
         probation: Some((4, 9)),
+        redundancy: Redundancy {
+            have: 2,
+            want: 3,
+            vote: Some(Standing {
+                answers: 3,
+                agreed: 2,
+                needed: 2,
+                dissents: 7,
+                aside: vec![Aside {
+                    host: host("other"),
+                    clean: 4,
+                    dissents: 2,
+                }],
+            }),
+        },
         applied: vec![
             Applied {
                 id: CommandId(u128::MAX),
@@ -138,7 +155,7 @@ pub(crate) fn sample(home: &HostId, owner: &HostId, seq: u64) -> Sample {
     }
 }
 
-/// All three answers of `owner`.
+/// All four answers of `owner`.
 pub(crate) fn answers(owner: &HostId) -> Vec<Answer> {
     vec![
         Answer::Commit(Box::new(record(owner, 9, vec![5; 300]))),
@@ -154,6 +171,12 @@ pub(crate) fn answers(owner: &HostId) -> Vec<Answer> {
             seq: 9,
             owner: owner.clone(),
             reason: "draining".to_owned(),
+        },
+        Answer::Held {
+            loop_id: loop_id("pressure-1"),
+            term: 3,
+            seq: 9,
+            host: owner.clone(),
         },
     ]
 }

@@ -190,7 +190,9 @@ fn commands_ride_until_a_record_holds_them_and_a_full_queue_refuses() {
     let again = sent(desk.overdue(first.at_ns + 50));
     assert_eq!(again.commands, first.commands, "the next owner gets them too");
     desk.check(&commit(&again)).unwrap();
-    desk.take(again.at_ns + 60, commit(&again));
+    let taken = desk.take(again.at_ns + 60, commit(&again));
+    assert_eq!(desk.command(command(0)), Queued::Waits, "only this home has it yet");
+    assert_eq!(desk.kept(taken.position()).len(), COMMANDS_WAITING_MAX - 1);
     assert_eq!(
         desk.command(command(0)),
         Queued::Ended(Applied {
@@ -199,6 +201,43 @@ fn commands_ride_until_a_record_holds_them_and_a_full_queue_refuses() {
         })
     );
     assert!(next(&mut desk).commands.is_empty());
+}
+
+#[test]
+fn an_outcome_is_told_when_its_record_outlives_the_home() {
+    let mut desk = desk();
+    let ask = |desk: &mut Desk, n: u128| {
+        let body = CommandBody::Setpoint(2.0);
+        desk.command(Command { id: CommandId(n), body })
+    };
+    let take = |desk: &mut Desk| {
+        let sample = next(desk);
+        desk.take(sample.at_ns + 1, commit(&sample))
+    };
+    assert_eq!(desk.unkept(), None);
+    ask(&mut desk, 1);
+    let first = take(&mut desk);
+    ask(&mut desk, 2);
+    let second = take(&mut desk);
+    let third = take(&mut desk);
+    assert_eq!(desk.unkept(), Some(second.position()), "the third holds nothing new");
+    let (term, seq) = third.position();
+    assert!(desk.kept((term, seq + 1)).is_empty(), "never taken");
+    assert!(desk.kept((0, 0)).is_empty());
+    let ids = |told: Vec<(Applied, Arc<Record>)>| told.into_iter().map(|(a, r)| (a.id.0, r.seq)).collect::<Vec<_>>();
+    assert_eq!(ids(desk.kept(first.position())), [(1, first.seq)]);
+    assert_eq!(
+        ids(desk.kept(third.position())),
+        [(2, second.seq)],
+        "a later record holds it too"
+    );
+    assert!(desk.kept(third.position()).is_empty(), "told once");
+    // Outcomes that may not be told yet take places of commands: what waits is bounded.
+    for n in 10..10 + COMMANDS_WAITING_MAX as u128 {
+        assert_eq!(ask(&mut desk, n), Queued::Waits);
+    }
+    take(&mut desk);
+    assert_eq!(ask(&mut desk, 99), Queued::Full);
 }
 
 #[test]

@@ -128,6 +128,7 @@ fn record(home: &Home, here: &HostId, events: Vec<Event>) -> Record {
         revision: home.spec.revision,
         digest: home.spec.digest,
         stepped_by: owner.clone(),
+        home: here.clone(),
         owner,
         at_ns: position.1 + 1,
         dt_ns: 1,
@@ -141,6 +142,7 @@ fn record(home: &Home, here: &HostId, events: Vec<Event>) -> Record {
         state: Arc::from([1, 2, 3]),
         faults_in_row: 0,
         probation: None,
+        redundancy: bumpless_core::Redundancy::default(),
         applied: home.applied.clone(),
         events,
         alarms: vec![],
@@ -243,6 +245,10 @@ impl Field for FakeField {
         };
         let record = self.cycle(id.as_str(), next, vec![applied.clone()], events);
         reply(CommandReply::Applied { applied, record });
+        Ok(())
+    }
+
+    fn kept(&self, _: &LoopId, _: (u64, u64)) -> Result<(), Error> {
         Ok(())
     }
 

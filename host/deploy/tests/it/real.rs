@@ -78,7 +78,10 @@ pub(crate) async fn host(cell: &Cell, dir: &std::path::Path) -> Real {
             deploy.arrive(DeployArrival::Loops(event));
         }
     });
-    let config = bumpless_loops::Config { workers: 2 };
+    let config = bumpless_loops::Config {
+        workers: 2,
+        ..bumpless_loops::Config::default()
+    };
     let wire = Arc::new(session.clone());
     let loops = Loops::start(
         &config,

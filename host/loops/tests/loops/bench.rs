@@ -159,7 +159,10 @@ impl Bench {
                     sender.try_send(record).unwrap();
                 }
             });
-            let config = Config { workers: 2 };
+            let config = Config {
+                workers: 2,
+                ..Config::default()
+            };
             let loops = Loops::start(&config, name.clone(), clock, io, engine.clone(), port, sink).unwrap();
             board.hosts.lock().unwrap().insert(name, loops);
         }
