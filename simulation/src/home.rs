@@ -453,6 +453,13 @@ impl World {
 
     /// A host of a loop is there, or gone, for all that its home knows.
     pub(crate) fn believe(&mut self, number: u32, rank: u8, there: bool) {
+        let l = &self.loops[number as usize];
+        let (home, host) = (l.home, l.ranked.get(usize::from(rank)).copied().unwrap_or(l.home));
+        let cut = self.network.is_cut(home, host) || self.network.is_cut(host, home);
+        if there && (cut || !self.host(host).runs()) {
+            // Another fault holds it; the end of that one brings the news again.
+            return;
+        }
         let l = &mut self.loops[number as usize];
         let bit = 1 << rank;
         if there {

@@ -387,7 +387,7 @@ impl World {
         for host in &fault.hosts {
             match fault.kind {
                 FaultKind::Kill | FaultKind::Clock => self.start(*host),
-                FaultKind::Pause => self.go_on(*host, fault.for_ms * 1_000_000 > LEASE_NS),
+                FaultKind::Pause => self.go_on(*host),
                 FaultKind::Loss => self.network.spoil(*host, false),
                 FaultKind::Disk => self.host_mut(*host).disk_full -= 1,
                 FaultKind::Slow => self.host_mut(*host).slow -= 1,
@@ -397,9 +397,8 @@ impl World {
         }
         if fault.kind == FaultKind::Partition {
             self.network.mend(number);
-            if fault.for_ms * 1_000_000 > LEASE_NS {
-                self.parted(&fault, true, 100_000_000);
-            }
+            // However short it was: a home may have started meanwhile, and looked around.
+            self.parted(&fault, true, 100_000_000);
         }
         if let Some(traced) = self.plan.trace
             && self.concerns(&fault, traced)
@@ -465,7 +464,7 @@ impl World {
     }
 
     /// A paused host goes on: what has arrived goes before what is late, and of each loop's samples only the newest counts.
-    fn go_on(&mut self, number: u32, was_given_up: bool) {
+    fn go_on(&mut self, number: u32) {
         let host = self.host_mut(number);
         host.pauses = host.pauses.saturating_sub(1);
         if host.pauses > 0 || !host.alive {
@@ -499,9 +498,7 @@ impl World {
                 self.queue.put(self.now_ns, event);
             }
         }
-        if was_given_up {
-            self.believed(number, true, 100_000_000, 1_000_000_000);
-        }
+        self.believed(number, true, 100_000_000, 1_000_000_000);
     }
 
     /// The homes of the loops that a host may hold hear that it is there, or gone.

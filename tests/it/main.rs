@@ -10,6 +10,7 @@
 //! | rollouts | one component for many loops, one loop first |
 //! | calls | the cell as a control service |
 //! | refusals | bad components, loops, requests, configurations, command lines |
+//! | votes | a host whose steps come out wrong, and who notices |
 //! | modbus | a real Modbus device that dies and comes back |
 //! | neighbours | two cells on one machine |
 //! | watching | metrics, the document of the API, the live feed |
@@ -37,6 +38,7 @@ mod refusals;
 mod restarts;
 mod rollouts;
 mod story;
+mod votes;
 mod watching;
 
 use std::time::Duration;

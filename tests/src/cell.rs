@@ -28,6 +28,8 @@ pub struct CellOptions {
     pub plant_tables: String,
     /// Tables besides of each controller host, as TOML.
     pub controller_tables: String,
+    /// Tables besides of single controller hosts, as TOML, by host name.
+    pub host_tables: Vec<(String, String)>,
     /// Keys besides of every host's `[cell]` table, as TOML lines.
     pub cell_extra: String,
     /// Words before the command of a host, by host name.
@@ -42,6 +44,7 @@ impl Default for CellOptions {
             bus: PILOT_PLANT.to_owned(),
             plant_tables: String::new(),
             controller_tables: String::new(),
+            host_tables: Vec::new(),
             cell_extra: String::new(),
             launchers: Vec::new(),
         }
@@ -99,7 +102,7 @@ impl Cell {
                 action: "written",
                 source,
             })?;
-        let name = format!("t-{:016x}", random());
+        let name = format!("test-{:016x}", random());
         let plant_options = HostOptions {
             name: PLANT.to_owned(),
             cell: name.clone(),
@@ -129,11 +132,13 @@ impl Cell {
     }
 
     fn spawn_controller(&self, name: &str) -> Result<HostProcess, Error> {
+        let own = self.options.host_tables.iter().find(|(host, _)| host == name);
+        let own = own.map(|(_, tables)| tables.as_str()).unwrap_or_default();
         let options = HostOptions {
             name: name.to_owned(),
             cell: self.name.clone(),
             connect: self.locators(name),
-            tables: self.options.controller_tables.clone(),
+            tables: format!("{}\n{own}", self.options.controller_tables),
             cell_extra: self.options.cell_extra.clone(),
             launcher: launcher(&self.options, name),
             ..HostOptions::default()

@@ -2,7 +2,11 @@
 
 use std::{
     collections::{BTreeMap, HashMap, HashSet},
-    sync::{Arc, Mutex},
+    num::NonZeroU64,
+    sync::{
+        Arc, Mutex,
+        atomic::{AtomicBool, AtomicU64, Ordering},
+    },
     time::Duration,
 };
 
@@ -33,6 +37,11 @@ pub(crate) fn loop_id() -> LoopId {
 pub(crate) struct Switchboard {
     hosts: Mutex<HashMap<HostId, Loops>>,
     pub(crate) cut: Mutex<HashSet<HostId>>,
+    /// Every so-manieth message is lost; none where 0.
+    pub(crate) lost_every: AtomicU64,
+    messages: AtomicU64,
+    /// Records reach nobody.
+    pub(crate) records_lost: AtomicBool,
 }
 
 struct Port {
@@ -47,6 +56,13 @@ impl Port {
             return;
         }
         drop(cut);
+        let (number, every) = (
+            self.board.messages.fetch_add(1, Ordering::Relaxed),
+            self.board.lost_every.load(Ordering::Relaxed),
+        );
+        if every > 0 && number % every == 0 {
+            return;
+        }
         let loops = self.board.hosts.lock().unwrap().get(to).cloned();
         if let Some(loops) = loops {
             loops.arrive(arrival);
@@ -74,6 +90,9 @@ impl Wire for Port {
         self.send(to, Arrival::StepAnswer(Box::new(answer.clone())));
     }
     fn publish_record(&self, record: &Record) {
+        if self.board.records_lost.load(Ordering::Relaxed) {
+            return;
+        }
         let others: Vec<HostId> = self
             .board
             .hosts
@@ -114,6 +133,8 @@ pub(crate) struct Bench {
     pub(crate) home: HostId,
     pub(crate) holders: Vec<HostId>,
     records: Receiver<Arc<Record>>,
+    /// Records with an outcome that somebody waits for, and whether the home is alone with them.
+    pub(crate) outcomes: Receiver<(Arc<Record>, bool)>,
     pub(crate) seen: Vec<Arc<Record>>,
     commands: u128,
     _runtime: tokio::runtime::Runtime,
@@ -126,6 +147,11 @@ pub(crate) fn component(name: &str) -> Vec<u8> {
 impl Bench {
     /// A plant host with one first-order process, and holders (the plant host itself where its name is among them).
     pub(crate) fn new(holders: &[&str], spec: impl FnOnce(&mut LoopSpec)) -> Self {
+        Self::with_errors(holders, &[], spec)
+    }
+
+    /// The same, with hosts whose steps come out wrong every so often.
+    pub(crate) fn with_errors(holders: &[&str], errs: &[(&str, u64)], spec: impl FnOnce(&mut LoopSpec)) -> Self {
         let runtime = tokio::runtime::Builder::new_multi_thread()
             .worker_threads(1)
             .enable_all()
@@ -144,6 +170,7 @@ impl Bench {
         let engine = Engine::new(bumpless_engine::Config::default()).unwrap();
         let (board, home) = (Arc::new(Switchboard::default()), host("plant"));
         let (sender, records): (Sender<Arc<Record>>, _) = crossbeam_channel::bounded(100_000);
+        let (outcomes_to, outcomes) = crossbeam_channel::bounded(1000);
         let holders: Vec<HostId> = holders.iter().map(|h| host(h)).collect();
         let mut names = vec![home.clone()];
         names.extend(holders.iter().filter(|h| **h != home).cloned());
@@ -154,14 +181,19 @@ impl Bench {
                 board: Arc::clone(&board),
             });
             let sender = sender.clone();
-            let sink = Arc::new(move |event| {
-                if let LoopsEvent::Record(record) = event {
-                    sender.try_send(record).unwrap();
-                }
+            let outcomes_to = outcomes_to.clone();
+            let sink = Arc::new(move |event| match event {
+                LoopsEvent::Record(record) => sender.try_send(record).unwrap(),
+                LoopsEvent::Outcome { record, alone } => outcomes_to.try_send((record, alone)).unwrap(),
+                LoopsEvent::Revised { .. } => {}
             });
+            let every = errs
+                .iter()
+                .find(|(host, _)| *host == name.as_str())
+                .map(|(_, every)| *every);
             let config = Config {
                 workers: 2,
-                ..Config::default()
+                flip_bits_every: every.and_then(NonZeroU64::new),
             };
             let loops = Loops::start(&config, name.clone(), clock, io, engine.clone(), port, sink).unwrap();
             board.hosts.lock().unwrap().insert(name, loops);
@@ -172,6 +204,7 @@ impl Bench {
             home,
             holders,
             records,
+            outcomes,
             seen: Vec::new(),
             commands: 0,
             _runtime: runtime,

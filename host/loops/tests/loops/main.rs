@@ -2,8 +2,11 @@
 //! fall silent, commands, swaps and rollbacks. Everything is checked on the records that the arbiter took.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "tests")]
 
+mod acknowledged;
 mod bench;
+mod degraded;
 mod probation;
+mod votes;
 
 use std::{collections::HashSet, sync::Arc};
 

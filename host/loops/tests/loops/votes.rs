@@ -1,0 +1,146 @@
+//! Votes over several hosts, some of which err.
+
+use bumpless_core::{Event, HostId, OnFewer, Record, Strategy, vote::CLEAN_STEPS};
+
+use crate::bench::{Bench, host};
+
+fn aside(record: &Record, name: &str) -> bool {
+    let vote = record.redundancy.vote.as_ref();
+    vote.is_some_and(|vote| vote.aside.iter().any(|a| a.host == host(name)))
+}
+
+fn dissent(record: &Record, name: &str) -> bool {
+    record.events.contains(&Event::Dissent { replica: host(name) })
+}
+
+fn no_majority(record: &Record) -> bool {
+    record.events.iter().any(|e| matches!(e, Event::NoMajority { .. }))
+}
+
+#[test]
+fn the_majority_is_taken_and_the_one_that_errs_loses_its_vote() {
+    let mut bench = Bench::with_errors(&["a", "b", "c"], &[("b", 4)], |spec| spec.strategy = Strategy::Vote(3));
+    let set_aside = bench.until("dissent", |r| dissent(r, "b"));
+    assert!(aside(&set_aside, "b"));
+    bench.until("it counts as lost", |r| {
+        r.events.contains(&Event::RedundancyLost { have: 2, want: 3 })
+    });
+    bench.settled();
+    for _ in 0..60 {
+        let record = bench.next();
+        let vote = record.redundancy.vote.clone().unwrap();
+        assert_eq!(record.faults_in_row, 0);
+        assert!(
+            aside(&record, "b"),
+            "every fourth step is wrong, so it is never clean for long"
+        );
+        assert_eq!((record.redundancy.have, record.redundancy.want), (2, 3));
+        assert!(vote.agreed >= vote.needed && vote.needed == 2, "{vote:?}");
+    }
+    let dissents = bench.next().redundancy.vote.clone().unwrap().dissents;
+    assert!(dissents > 10, "they are counted: {dissents}");
+    // A turned bit moves an output by a quarter at least; around its setpoint the loop moves it by far less.
+    let outputs: Vec<f64> = bench.seen.iter().rev().take(60).map(|r| r.outputs[0]).collect();
+    let jump = outputs
+        .windows(2)
+        .map(|pair| (pair[0] - pair[1]).abs())
+        .fold(0.0, f64::max);
+    assert!(jump < 2.0, "an output jumped by {jump}");
+}
+
+#[test]
+fn one_that_erred_once_votes_again_after_clean_steps() {
+    let every = u64::from(CLEAN_STEPS) * 3;
+    let mut bench = Bench::with_errors(&["a", "b", "c"], &[("b", every)], |spec| {
+        spec.strategy = Strategy::Vote(3)
+    });
+    let lost = bench.until("dissent", |r| dissent(r, "b"));
+    let back = bench.until("it votes again", |r| {
+        r.events.contains(&Event::Readmitted { replica: host("b") })
+    });
+    assert!(back.seq >= lost.seq + u64::from(CLEAN_STEPS));
+    assert!(!aside(&back, "b"));
+    bench.until("the loop is whole again", |r| r.redundancy.whole());
+}
+
+#[test]
+fn an_owner_that_errs_is_outvoted_by_the_others() {
+    let mut bench = Bench::with_errors(&["a", "b", "c"], &[("a", 3)], |spec| spec.strategy = Strategy::Vote(3));
+    let first = bench.next();
+    let errs = host("a");
+    if first.owner != errs {
+        bench
+            .at(&bench.home)
+            .move_to(&crate::bench::loop_id(), errs.clone())
+            .unwrap();
+    }
+    bench.until("the one that errs owns the loop", |r| r.owner == errs);
+    bench.until("its own vote is taken from it", |r| aside(r, "a"));
+    bench.settled();
+    let outputs: Vec<f64> = (0..40).map(|_| bench.next().outputs[0]).collect();
+    let jump = outputs
+        .windows(2)
+        .map(|pair| (pair[0] - pair[1]).abs())
+        .fold(0.0, f64::max);
+    assert!(jump < 2.0, "an output jumped by {jump}");
+}
+
+#[test]
+fn without_a_majority_the_policy_decides_and_says_so() {
+    let mut bench = Bench::with_errors(&["a", "b"], &[("b", 1)], |spec| {
+        (spec.strategy, spec.replicas) = (Strategy::Vote(2), 2);
+    });
+    let first = bench.until("no majority", no_majority);
+    assert!(first.events.contains(&Event::PolicyHeld) && first.faults_in_row > 0);
+    for _ in 0..10 {
+        let record = bench.next();
+        assert!(no_majority(&record), "{:?}", record.events);
+        assert_eq!(record.outputs, first.outputs, "the output holds");
+        assert!(
+            record.redundancy.vote.as_ref().unwrap().aside.is_empty(),
+            "nobody is to blame"
+        );
+    }
+}
+
+/// Cuts all but the owner off; gives the owner.
+fn cut_all_but_the_owner(bench: &mut Bench) -> HostId {
+    let owner = bench.next().owner.clone();
+    let others = bench.holders.iter().filter(|h| **h != owner).cloned();
+    bench.board.cut.lock().unwrap().extend(others);
+    owner
+}
+
+#[test]
+fn with_fewer_than_asked_for_a_vote_goes_on_where_the_policy_lets_it() {
+    let mut bench = Bench::new(&["a", "b", "c"], |spec| spec.strategy = Strategy::Vote(3));
+    bench.until("all vote", |r| r.redundancy.whole());
+    let owner = cut_all_but_the_owner(&mut bench);
+    let alone = bench.until("it goes on alone", |r| r.redundancy.have == 1 && r.faults_in_row == 0);
+    assert_eq!(alone.owner, owner);
+    let lost = bench.seen.iter().any(|r| {
+        let events = r.events.iter();
+        events
+            .clone()
+            .any(|e| matches!(e, Event::RedundancyLost { want: 3, .. }))
+    });
+    assert!(lost, "the loss is told");
+    bench.board.cut.lock().unwrap().clear();
+    bench.until("all vote again", |r| {
+        r.events.contains(&Event::RedundancyRestored { want: 3 })
+    });
+}
+
+#[test]
+fn with_fewer_than_asked_for_a_vote_stops_where_the_policy_says_so() {
+    let mut bench = Bench::new(&["a", "b", "c"], |spec| {
+        spec.strategy = Strategy::Vote(3);
+        spec.policy.on_fewer = OnFewer::Fault;
+    });
+    bench.until("all vote", |r| r.redundancy.whole());
+    cut_all_but_the_owner(&mut bench);
+    let stopped = bench.until("one alone is no majority", |r| r.redundancy.have == 1 && no_majority(r));
+    assert!(stopped.events.contains(&Event::PolicyHeld) && stopped.faults_in_row > 0);
+    bench.board.cut.lock().unwrap().clear();
+    bench.until("it goes on by itself", |r| r.faults_in_row == 0 && r.redundancy.whole());
+}
