@@ -33,9 +33,9 @@ use crate::{
 const SUSPECT_NS_MIN: u64 = 1_000_000_000;
 /// Longest time that it is passed over, in ns.
 const SUSPECT_NS_MAX: u64 = 60_000_000_000;
-/// Terms skipped when a home comes back from a restart. Records reach the disk within 100 ms, so at most a few terms
-/// given out before a crash are unknown afterwards; sixteen takeovers in that time are beyond what the desk ever does.
-pub const TERMS_SKIPPED_AT_RESTART: u64 = 16;
+/// Terms skipped when a home comes back from a restart. Records reach the disk within a second, so the terms given out in that
+/// time may be unknown afterwards: at most two for each cycle of 1 ms, and as many again for a disk that is slow.
+pub const TERMS_SKIPPED_AT_RESTART: u64 = 4096;
 
 /// Counts since the home started.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]

@@ -218,3 +218,25 @@ impl Quality {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "tests")]
+
+    use super::*;
+
+    #[test]
+    fn a_strategy_is_one_word_in_json() {
+        for (text, strategy) in [
+            ("\"round-robin\"", model::Strategy::RoundRobin),
+            ("\"p2c\"", model::Strategy::P2c),
+            ("\"vote(3)\"", model::Strategy::Vote(3)),
+        ] {
+            assert_eq!(serde_json::to_string(&Strategy(strategy)).unwrap(), text);
+            assert_eq!(serde_json::from_str::<Strategy>(text).unwrap(), Strategy(strategy));
+        }
+        for bad in ["\"vote\"", "{\"vote\":3}", "3", "\"vote(3) \""] {
+            assert!(serde_json::from_str::<Strategy>(bad).is_err(), "{bad}");
+        }
+    }
+}

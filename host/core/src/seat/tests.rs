@@ -115,7 +115,7 @@ fn conclude_with(step: Result<Stepped, Fault>, standing: Standing, base: &Record
         standing,
         events: vec![],
         probation: None,
-        redundancy: crate::Redundancy::default(),
+        redundancy: Redundancy::default(),
         step,
         cycle_ns: 5,
     })
