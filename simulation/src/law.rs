@@ -121,6 +121,7 @@ pub(crate) fn spec(number: u32, revision: u64) -> LoopSpec {
         )]),
         listens: Vec::new(),
         fallback: None,
+        fallback_parameters: BTreeMap::new(),
         policy: Policy {
             // One that errs must never be the last that votes.
             on_fewer: OnFewer::Fault,

@@ -56,7 +56,7 @@ fn read_as_all(bytes: &[u8]) {
 
 #[test]
 fn every_message_comes_back() {
-    assert_eq!(envelopes().len(), 10);
+    assert_eq!(envelopes().len(), 11);
 }
 
 #[test]

@@ -110,7 +110,7 @@ async fn every_lane_arrives_whole() {
         (0, 0, 0, 0),
         "{a:?} {b:?}"
     );
-    assert_eq!((a.sent, b.sent, a.received, b.received), (4, 8, 8, 4), "{a:?} {b:?}");
+    assert_eq!((a.sent, b.sent, a.received, b.received), (4, 9, 9, 4), "{a:?} {b:?}");
 }
 
 #[tokio::test]

@@ -1,5 +1,6 @@
 //! What a stranger on the same network can put on a host's keys: it is reported and counted, and nothing else happens.
 
+use bumpless_cell::wire::VERSION;
 use bumpless_cell::{Arrival, Error, limits::MALFORMED_REPORTS_PER_S};
 use zenoh::Wait;
 
@@ -42,10 +43,10 @@ async fn bad_bytes_are_reported_one_by_one_and_good_ones_still_arrive() {
     let foreign = bumpless_cell::wire::encode(&vitals(a.name())).unwrap();
     let table: Vec<(&str, Vec<u8>, &str)> = vec![
         ("host/a/sample/b", b"no sample".to_vec(), "wire version 110"),
-        ("host/a/answer/b", vec![1, 200, 200, 200], "are no answer"),
+        ("host/a/answer/b", vec![VERSION, 200, 200, 200], "are no answer"),
         ("host/a/step/b", vec![], "it is empty"),
         ("host/a/step-answer/b", vec![0; 4], "wire version 0"),
-        ("host/a/ping/b", vec![1; 99], "more than the 16 bytes"),
+        ("host/a/ping/b", vec![VERSION; 99], "more than the 16 bytes"),
         ("record/pressure-2", good.clone(), "another sender or loop than its key"),
         ("vitals/b", foreign, "another sender or loop than its key"),
         ("vitals/B", vec![1], "the host's name is no name"),
@@ -129,7 +130,7 @@ async fn a_bad_request_is_refused_to_its_asker() {
         .unwrap();
     let reply = replies.recv_async().await.unwrap();
     let sample = reply.result().expect("a reply of our own, no time-out");
-    assert_eq!(sample.attachment().unwrap().to_bytes().as_ref(), [1, 1]);
+    assert_eq!(sample.attachment().unwrap().to_bytes().as_ref(), [VERSION, 1]);
     let text = sample.payload().try_to_string().unwrap().into_owned();
     assert!(text.contains("it has no version"), "{text}");
     assert!(report(&mut a).await.1.contains("it has no version"));
@@ -142,7 +143,7 @@ async fn a_bad_reply_is_an_error_of_its_own() {
     for (attachment, reason) in [
         (None, "it has no version"),
         (Some(vec![7, 0]), "wire version 7"),
-        (Some(vec![1, 9]), "neither gives nor refuses"),
+        (Some(vec![VERSION, 9]), "neither gives nor refuses"),
     ] {
         let queryable = stranger
             .declare_queryable("bumpless/bad-reply/host/b/request/*")
