@@ -124,16 +124,21 @@ pub struct Bench<C> {
     mode: Mode,
     setpoint: f64,
     wanted: Vec<f64>,
+    /// Numbers of the outputs that have an actuator.
+    wired: Vec<u32>,
     controller: PhantomData<C>,
 }
 
 impl<C: Controller> Bench<C> {
     /// Starts a controller in automatic, with parameters by name (defaults for the rest) and what its outputs hold.
-    /// Outputs are connected; inputs become so when they are first set.
+    /// Outputs with a value are connected, the others have no actuator; inputs become connected when they are first set.
     ///
     /// Fails with the controller's fault, or with [`Fault::BadParameter`] for a name that it does not have.
     pub fn start(parameters: &[(&str, f64)], track: &[f64]) -> Result<Self, Fault> {
-        let state = glue::start::<C>(&parameter_values::<C>(parameters)?, track)?;
+        let outputs = output_ports::<C>();
+        let mut all = track.to_vec();
+        all.resize(outputs.len().max(track.len()), 0.0);
+        let state = glue::start::<C>(&parameter_values::<C>(parameters)?, &all)?;
         let mut held = track.iter();
         let readings = C::DESCRIPTION
             .ports
@@ -158,6 +163,7 @@ impl<C: Controller> Bench<C> {
             mode: Mode::Automatic,
             setpoint: 0.0,
             wanted: track.to_vec(),
+            wired: outputs.into_iter().take(track.len()).collect(),
             controller: PhantomData,
         })
     }
@@ -206,7 +212,7 @@ impl<C: Controller> Bench<C> {
         });
     }
 
-    /// Runs one cycle of `dt_s` seconds. Gives what the actuators hold after it, one value per output: the writes in
+    /// Runs one cycle of `dt_s` seconds. Gives what the actuators hold after it, one value per connected output: the writes in
     /// automatic, the same as before in manual. A fault leaves everything as it was.
     pub fn step(&mut self, dt_s: f64) -> Result<Vec<f64>, Fault> {
         let dt_ns = ((dt_s * 1e9).round() as u64).max(1);
@@ -232,31 +238,33 @@ impl<C: Controller> Bench<C> {
         self.sequence = cycle.sequence;
         self.time_ns = cycle.time_ns;
         self.desk.inbox.clear();
-        let outputs: Vec<u32> = (0..)
-            .zip(C::DESCRIPTION.ports)
-            .filter(|(_, p)| p.direction == Direction::Output)
-            .map(|(i, _)| i)
+        let wired = self.wired.clone();
+        self.wanted = wired
+            .iter()
+            .map(|&port| self.written_to(port).unwrap_or(f64::NAN))
             .collect();
-        let written = |port: u32| {
-            self.desk
-                .writes
-                .iter()
-                .rev()
-                .find(|(p, _)| *p == port)
-                .map(|(_, value)| *value)
-        };
-        self.wanted = outputs.iter().map(|&port| written(port).unwrap_or(f64::NAN)).collect();
         if self.mode == Mode::Automatic {
-            for (&port, value) in outputs.iter().zip(self.wanted.clone()) {
+            for (&port, value) in wired.iter().zip(self.wanted.clone()) {
                 if value.is_finite() {
                     self.put(port, Some(good(value)));
                 }
             }
         }
-        Ok(outputs.iter().map(|&port| self.desk.read(port).value).collect())
+        Ok(wired.iter().map(|&port| self.desk.read(port).value).collect())
     }
 
-    /// What the last step wrote, one value per output; NaN where it wrote nothing.
+    fn written_to(&self, port: u32) -> Option<f64> {
+        let mut writes = self.desk.writes.iter().rev();
+        writes.find(|(p, _)| *p == port).map(|(_, value)| *value)
+    }
+
+    /// What the last step wrote to an output, connected or not; none where it wrote nothing.
+    #[must_use]
+    pub fn written(&self, output: Output) -> Option<f64> {
+        self.written_to(output.number)
+    }
+
+    /// What the last step wrote, one value per connected output; NaN where it wrote nothing.
     #[must_use]
     pub fn wanted(&self) -> &[f64] {
         &self.wanted
@@ -292,12 +300,20 @@ impl<C: Controller> Bench<C> {
         let taken = migrated.is_ok();
         let state = match migrated {
             Ok(state) => state,
-            Err(_) => glue::start::<D>(&parameter_values::<D>(parameters)?, &self.track())?,
+            Err(_) => glue::start::<D>(&parameter_values::<D>(parameters)?, &self.track::<D>())?,
         };
         let of_name = |name: &str| {
             let at = C::DESCRIPTION.ports.iter().position(|p| p.name == name)?;
             self.desk.readings.get(at).copied().flatten()
         };
+        let wired_name = |number: u32| C::DESCRIPTION.ports.get(number as usize).map(|p| p.name);
+        let names: Vec<&str> = self.wired.iter().filter_map(|&number| wired_name(number)).collect();
+        let wired = output_ports::<D>();
+        let wired = wired.into_iter().filter(|&number| {
+            let port = D::DESCRIPTION.ports.get(number as usize);
+            port.is_some_and(|port| names.contains(&port.name))
+        });
+        let wired = wired.collect();
         let readings = D::DESCRIPTION.ports.iter().map(|p| of_name(p.name)).collect();
         let desk = Desk { readings, ..self.desk };
         let Self {
@@ -317,6 +333,7 @@ impl<C: Controller> Bench<C> {
                 mode,
                 setpoint,
                 wanted,
+                wired,
                 controller: PhantomData,
             },
             taken,
@@ -331,17 +348,24 @@ impl<C: Controller> Bench<C> {
             state_layout: d.state_layout,
             bytes: &self.state,
         };
-        glue::migrate::<D>(&origin, &parameter_values::<D>(parameters)?, &self.track())
+        glue::migrate::<D>(&origin, &parameter_values::<D>(parameters)?, &self.track::<D>())
     }
 
-    /// What the outputs hold.
-    fn track(&self) -> Vec<f64> {
-        let ports = (0..).zip(C::DESCRIPTION.ports);
-        ports
-            .filter(|(_, p)| p.direction == Direction::Output)
-            .map(|(i, _)| self.desk.read(i).value)
+    /// What the outputs of a controller hold, found by name among ours; 0 where there is no such actuator.
+    fn track<D: Controller>(&self) -> Vec<f64> {
+        let ours = |name: &str| (0..).zip(C::DESCRIPTION.ports).find(|(_, p)| p.name == name);
+        let outputs = D::DESCRIPTION.ports.iter().filter(|p| p.direction == Direction::Output);
+        outputs
+            .map(|p| ours(p.name).map_or(0.0, |(i, _)| self.desk.read(i).value))
             .collect()
     }
+}
+
+/// Numbers of a controller's output ports.
+fn output_ports<C: Controller>() -> Vec<u32> {
+    let ports = (0..).zip(C::DESCRIPTION.ports);
+    let outputs = ports.filter(|(_, p)| p.direction == Direction::Output);
+    outputs.map(|(i, _)| i).collect()
 }
 
 /// One value per parameter in the table's order.

@@ -1,7 +1,18 @@
-//! Small pieces that laws are made of: pure, total functions of numbers.
+//! Small pieces that laws are made of: pure, total functions of numbers, and the few with memory ([`Delay`], [`LeadLag`],
+//! [`Balance`]) as parts of a law's own state.
 //!
-//! Never: state, time or I/O of their own; a law keeps what must last. None of them uses `f64::clamp`, whose panic message
+//! Never: time or I/O of their own; a law keeps what must last. None of them uses `f64::clamp`, whose panic message
 //! alone would triple a component's size.
+
+mod balance;
+mod curve;
+mod delay;
+mod lag;
+
+pub use balance::Balance;
+pub use curve::{curve, place};
+pub use delay::{CELLS, Delay, PIECES_MAX, Piece};
+pub use lag::LeadLag;
 
 /// `value` within `low` and `high`. A NaN stays one: the host must see it, not an innocent bound.
 #[must_use]

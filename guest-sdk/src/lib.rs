@@ -64,7 +64,7 @@
 extern crate self as bumpless_sdk;
 
 mod table;
-pub use table::{Description, Direction, Input, Kind, Output, Parameter, ParameterSpec, PortSpec};
+pub use table::{Description, Direction, Input, Kind, Output, Parameter, ParameterSpec, PortSpec, joined};
 
 mod controller;
 pub use controller::{Controller, Origin, Parameters, Track};
@@ -91,7 +91,7 @@ pub mod bench;
 pub mod prelude {
     pub use crate::{
         Controller, Cycle, Description, Fault, Input, Io, Level, Mode, Origin, Output, Parameter, ParameterSpec,
-        Parameters, PortSpec, Priority, Quality, Reading, Track,
+        Parameters, PortSpec, Priority, Quality, Reading, Track, joined,
     };
 }
 

@@ -153,6 +153,33 @@ impl ParameterSpec {
     }
 }
 
+/// Two tables as one, the first one's rows first: `N` is the number of all rows. Stops the build where it is not.
+///
+/// ```
+/// use bumpless_sdk::{PortSpec, joined};
+/// const SHARED: &[PortSpec] = &[PortSpec::analog_output("out", "", "To the actuator")];
+/// const PORTS: &[PortSpec] = &joined::<_, 2>(&[PortSpec::analog_input("pv", "", "Measurement")], SHARED);
+/// assert_eq!(PORTS[1].name, "out");
+/// ```
+#[must_use]
+pub const fn joined<T: Copy, const N: usize>(first: &[T], second: &[T]) -> [T; N] {
+    assert!(
+        first.len() + second.len() == N && !first.is_empty(),
+        "the number of rows is not the sum of both tables"
+    );
+    let mut rows = [first[0]; N];
+    let mut i = 1;
+    while i < N {
+        rows[i] = if i < first.len() {
+            first[i]
+        } else {
+            second[i - first.len()]
+        };
+        i += 1;
+    }
+    rows
+}
+
 /// What a controller says of itself.
 #[derive(Debug, Clone, Copy)]
 pub struct Description {
