@@ -6,7 +6,7 @@ use std::{path::PathBuf, sync::Arc};
 
 use bumpless_core::{Cycle, Direction, Frame, Mode, Reading};
 use bumpless_engine::{Engine, Prepared};
-use bumpless_isa::{Demand, Memory, Sample, Tuning};
+use bumpless_isa::{Memory, Sample, Tuning};
 
 use crate::error::Error;
 
@@ -78,35 +78,15 @@ pub(crate) fn frames(prepared: &Prepared) -> Vec<Frame> {
 /// The same samples for the law itself.
 pub(crate) fn samples() -> Vec<Sample> {
     (0..SAMPLES)
-        .map(|number| Sample {
-            pv: measurement(number),
-            setpoint: SETPOINT,
-            feedforward: 0.0,
-            held: Some(SETPOINT),
-            demand: Demand::Automatic,
-            dt_s: DT_NS as f64 / 1e9,
-            elapsed_s: Some(DT_NS as f64 / 1e9),
-        })
+        .map(|number| Sample::automatic(measurement(number), SETPOINT, Some(SETPOINT), DT_NS as f64 / 1e9))
         .collect()
 }
 
 /// The defaults of `pid`'s table.
 pub(crate) const fn tuning() -> Tuning {
     Tuning {
-        gain: 1.0,
-        ti_s: 60.0,
-        td_s: 0.0,
-        td_filter_s: 0.0,
-        beta: 1.0,
-        gamma: 0.0,
-        out_low: 0.0,
-        out_high: 100.0,
-        out_rate_per_s: 0.0,
-        dead_band: 0.0,
-        ff_gain: 1.0,
         bias: 50.0,
-        balance_s: 60.0,
-        pv_filter_s: 0.0,
+        ..Tuning::pi(1.0, 60.0, 0.0, 100.0)
     }
 }
 

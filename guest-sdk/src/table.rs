@@ -340,6 +340,12 @@ impl Parameter {
         assert!(index < parameters.len(), "no parameter of that name");
         Self { index }
     }
+
+    /// Its place in the table.
+    #[must_use]
+    pub const fn index(self) -> usize {
+        self.index
+    }
 }
 
 /// The first port of that name, or the table's length.

@@ -1,4 +1,4 @@
-//! Two PI blocks, one inside the other: the outer one's output is the inner one's setpoint.
+//! Two PID blocks, one inside the other: the outer one's output is the inner one's setpoint.
 //!
 //! ```text
 //! setpoint ─► outer ── inner setpoint ─► inner ── output ─► actuator
@@ -10,12 +10,26 @@
 //! ISA-TR5.9-2023; Shinskey, *Process Control Systems* (1996), ch. 6.
 //!
 //! ```text
-//!   New ── first sample: the outer follows inner-pv, the inner follows the actuator ──► as `bumpless_isa` draws it
+//!   Hand:  something else decides the output. The inner block follows it, the outer one follows inner-pv.
+//!   Inner: the inner block runs on a setpoint of its own; the outer one follows that setpoint.
+//!   Both:  the cascade.
+//!   Hand → Inner, Hand → Both, Inner → Both, and back: the output and the inner setpoint go on from where they are.
 //! ```
 //! Never: ports, clocks or bytes.
 
-use bumpless_isa::{Demand, Memory, Phase, Sample as BlockSample, Tuning};
+use bumpless_isa::{Demand, Memory, Memory1, Phase, Sample as BlockSample, Tuning};
 use serde::{Deserialize, Serialize};
+
+/// Who decides what.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Lead {
+    /// Somebody else decides the output: it is this value.
+    Hand(f64),
+    /// The inner loop is alone, with this setpoint; with none it keeps the one that it has.
+    Inner(Option<f64>),
+    /// The outer block decides the inner setpoint, the inner one the output.
+    Both,
+}
 
 /// What one step is about.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -28,8 +42,8 @@ pub struct Sample {
     pub setpoint: f64,
     /// What the actuator holds; none where it cannot be read.
     pub held: Option<f64>,
-    /// Somebody else decides the output.
-    pub manual: bool,
+    /// Who decides.
+    pub lead: Lead,
     /// Time since the step before, s; greater than 0.
     pub dt_s: f64,
 }
@@ -41,6 +55,24 @@ pub struct Cascade {
     pub outer: Memory,
     /// The inner block.
     pub inner: Memory,
+}
+
+/// The state in layout 1: blocks without limits and sources of their setpoints.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Cascade1 {
+    /// The outer block.
+    pub outer: Memory1,
+    /// The inner block.
+    pub inner: Memory1,
+}
+
+impl From<Cascade1> for Cascade {
+    fn from(old: Cascade1) -> Self {
+        Self {
+            outer: old.outer.into(),
+            inner: old.inner.into(),
+        }
+    }
 }
 
 impl Cascade {
@@ -56,36 +88,42 @@ impl Cascade {
     /// Computes one step and gives the output.
     #[must_use]
     pub fn step(&mut self, outer: &Tuning, inner: &Tuning, sample: &Sample) -> f64 {
-        let block = |pv, setpoint, held, demand| BlockSample {
-            pv,
-            setpoint,
-            feedforward: 0.0,
-            held,
-            demand,
-            dt_s: sample.dt_s,
-            elapsed_s: Some(sample.dt_s),
-        };
         // Beyond its limits an inner measurement is no setpoint that the outer block could have asked for.
         let reached = sample.inner_pv.max(outer.out_low).min(outer.out_high);
-        let first = self.inner.phase == Phase::New;
-        let outer_demand = if sample.manual || first {
-            Demand::Follow(reached)
-        } else {
-            Demand::Automatic
+        let inner_runs = self.inner.phase == Phase::Running;
+        let own_setpoint = if inner_runs { self.inner.setpoint } else { reached };
+        let outer_demand = match sample.lead {
+            Lead::Inner(wanted) => Demand::Follow(wanted.unwrap_or(own_setpoint)),
+            Lead::Hand(_) => Demand::Follow(reached),
+            Lead::Both if self.inner.phase == Phase::New => Demand::Follow(reached),
+            Lead::Both => Demand::Automatic,
         };
-        let held = sample.held.unwrap_or(self.inner.output);
-        let inner_demand = if sample.manual {
-            Demand::Follow(held)
-        } else {
-            Demand::Automatic
+        let inner_demand = match sample.lead {
+            Lead::Hand(value) => Demand::Follow(value),
+            Lead::Inner(_) | Lead::Both => Demand::Automatic,
         };
-        let inner_setpoint = self
-            .outer
-            .step(outer, &block(sample.pv, sample.setpoint, Some(reached), outer_demand));
+        let inner_setpoint = self.outer.step(
+            outer,
+            &BlockSample {
+                demand: outer_demand,
+                // The integral follows what the inner loop reaches; the output goes on from what it was asked for.
+                reset: Some(reached),
+                ..BlockSample::automatic(sample.pv, sample.setpoint, Some(own_setpoint), sample.dt_s)
+            },
+        );
         self.inner.step(
             inner,
-            &block(sample.inner_pv, inner_setpoint, sample.held, inner_demand),
+            &BlockSample {
+                demand: inner_demand,
+                ..BlockSample::automatic(sample.inner_pv, inner_setpoint, sample.held, sample.dt_s)
+            },
         )
+    }
+
+    /// Somebody else decides the output and a measurement is missing: both start anew from the first good ones.
+    pub const fn follow_blind(&mut self, value: f64) {
+        self.outer.follow_blind(0.0);
+        self.inner.follow_blind(value);
     }
 
     /// New tunings, outer and inner each: the output goes on without a bump.

@@ -34,6 +34,8 @@
 //! ```
 //! The first automatic step from `New` or `Following` gives exactly what the actuator holds, whatever the error, and D starts
 //! from rest.
+//! The setpoint r is the given one within its limits and, where it has a rate, on its way to it. When its source changes, the
+//! integral takes what P would jump by. *Hold* leaves I as it is; *reset* puts another value in H's place.
 //! Never: a panic; numbers out of range give a number out of range, which the glue refuses.
 
 use bumpless_sdk::blocks::{dead_band, derivative, lag_part, limit, rate_limit};
@@ -61,7 +63,7 @@ pub enum Demand {
     Follow(f64),
 }
 
-/// What one step is about.
+/// What one step is about; [`Sample::automatic`] has the usual values.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Sample {
     /// Measurement y.
@@ -78,6 +80,72 @@ pub struct Sample {
     pub dt_s: f64,
     /// ΔT, s: time since the last measurement that counted, where this one counts.
     pub elapsed_s: Option<f64>,
+    /// Is the setpoint another block's?
+    pub remote: bool,
+    /// Does the integral stand still?
+    pub hold: bool,
+    /// What the integral follows instead of the actuator, where that is told.
+    pub reset: Option<f64>,
+}
+
+impl Sample {
+    /// The law decides, the measurement counts, and nothing else is connected.
+    #[must_use]
+    pub const fn automatic(pv: f64, setpoint: f64, held: Option<f64>, dt_s: f64) -> Self {
+        Self {
+            pv,
+            setpoint,
+            feedforward: 0.0,
+            held,
+            demand: Demand::Automatic,
+            dt_s,
+            elapsed_s: Some(dt_s),
+            remote: false,
+            hold: false,
+            reset: None,
+        }
+    }
+}
+
+/// The state in layout 1, before setpoints had limits and sources of their own.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Memory1 {
+    /// As in [`Memory`]; so are the others.
+    pub phase: Phase,
+    /// Last output.
+    pub output: f64,
+    /// I.
+    pub integral: f64,
+    /// y.
+    pub pv: f64,
+    /// r.
+    pub setpoint: f64,
+    /// Feedforward.
+    pub feedforward: f64,
+    /// d.
+    pub derivative: f64,
+    /// r of d.
+    pub derivative_setpoint: f64,
+    /// Time waited, s.
+    pub waited_s: f64,
+}
+
+impl From<Memory1> for Memory {
+    fn from(old: Memory1) -> Self {
+        Self {
+            phase: old.phase,
+            output: old.output,
+            integral: old.integral,
+            pv: old.pv,
+            setpoint: old.setpoint,
+            feedforward: old.feedforward,
+            derivative: old.derivative,
+            derivative_setpoint: old.derivative_setpoint,
+            waited_s: old.waited_s,
+            remote: false,
+            alarms: 0,
+        }
+    }
 }
 
 /// The state: everything that lasts from step to step.
@@ -91,7 +159,7 @@ pub struct Memory {
     pub integral: f64,
     /// y after its filter.
     pub pv: f64,
-    /// r of the last step.
+    /// r of the last step, within its limits.
     pub setpoint: f64,
     /// Feedforward of the last step, before its gain.
     pub feedforward: f64,
@@ -101,6 +169,10 @@ pub struct Memory {
     pub derivative_setpoint: f64,
     /// Time since the last measurement that counted, s.
     pub waited_s: f64,
+    /// Was the setpoint another block's in the last step?
+    pub remote: bool,
+    /// Alarms that are active, one bit each; the glue's own.
+    pub alarms: u8,
 }
 
 impl Memory {
@@ -117,7 +189,15 @@ impl Memory {
             derivative: 0.0,
             derivative_setpoint: 0.0,
             waited_s: 0.0,
+            remote: false,
+            alarms: 0,
         }
+    }
+
+    /// Are the numbers that last numbers? Infinite ones would never leave the state again.
+    #[must_use]
+    pub const fn is_sound(&self) -> bool {
+        self.integral.is_finite() && self.derivative.is_finite() && self.pv.is_finite() && self.output.is_finite()
     }
 
     /// e, less the dead band.
@@ -140,9 +220,9 @@ impl Memory {
             Some(value) => value,
             None => self.output,
         };
-        if let (Phase::Running, Some(elapsed_s)) = (self.phase, sample.elapsed_s) {
+        if let (Phase::Running, Some(elapsed_s), false) = (self.phase, sample.elapsed_s, sample.hold) {
             // Uses the memory of the step before, to which `held` belongs: must come before `observe`.
-            self.integrate(t, held, elapsed_s);
+            self.integrate(t, sample.reset.unwrap_or(held), elapsed_s);
         }
         self.observe(t, sample);
         let rest = self.rest(t);
@@ -175,31 +255,60 @@ impl Memory {
         }
     }
 
+    /// The setpoint that the law follows in this step: within its limits, and at most so fast.
+    fn wanted_setpoint(&self, t: &Tuning, sample: &Sample) -> f64 {
+        let target = limit(sample.setpoint, t.sp_low, t.sp_high);
+        if self.phase == Phase::New {
+            target
+        } else {
+            rate_limit(target, self.setpoint, t.sp_rate_per_s, sample.dt_s)
+        }
+    }
+
     /// Takes the sample in: filter, derivative, setpoint, feedforward.
     fn observe(&mut self, t: &Tuning, sample: &Sample) {
+        // With setpoint tracking the law takes over at the measurement, and goes to the setpoint at its rate.
+        let follows = t.sp_track && matches!(sample.demand, Demand::Follow(_));
+        let setpoint = if follows {
+            limit(sample.pv, t.sp_low, t.sp_high)
+        } else {
+            self.wanted_setpoint(t, sample)
+        };
+        if self.phase == Phase::Running && sample.remote != self.remote {
+            // Another source is no wish for another output: the integral takes what P would jump by.
+            let before = self.rest(t);
+            self.setpoint = setpoint;
+            self.integral += before - self.rest(t);
+            self.derivative_setpoint = setpoint;
+        }
+        self.remote = sample.remote;
         if self.phase == Phase::New {
             self.pv = sample.pv;
             self.derivative = 0.0;
-            self.derivative_setpoint = sample.setpoint;
+            self.derivative_setpoint = setpoint;
         } else if let Some(elapsed_s) = sample.elapsed_s {
             let pv = self.pv + (sample.pv - self.pv) * lag_part(t.pv_filter_s, elapsed_s);
-            let change = t.gamma * (sample.setpoint - self.derivative_setpoint) - (pv - self.pv);
+            let change = t.gamma * (setpoint - self.derivative_setpoint) - (pv - self.pv);
             self.derivative = match self.phase {
                 Phase::Running => derivative(self.derivative, change, t.td_s, t.td_filter_s, elapsed_s),
                 // Starts from rest: a D that was balanced at the transfer would fade after it and pull the output along.
                 Phase::New | Phase::Following => 0.0,
             };
-            self.derivative_setpoint = sample.setpoint;
+            self.derivative_setpoint = setpoint;
             self.pv = pv;
         }
-        self.setpoint = sample.setpoint;
+        self.setpoint = setpoint;
         self.feedforward = sample.feedforward;
     }
 
     /// Something else decides the output and there is no measurement: follows, and forgets the measurement, so that the law
     /// starts anew from the first good one.
     pub const fn follow_blind(&mut self, value: f64) {
-        *self = Self::new(value);
+        *self = Self {
+            remote: self.remote,
+            alarms: self.alarms,
+            ..Self::new(value)
+        };
     }
 
     /// Moves the integral so that the output under the new tuning is, for the last sample, what it was under the old.

@@ -12,6 +12,18 @@ pub const PORTS: &[PortSpec] = &[
     PortSpec::analog_input("track", "", "Value that the output follows while track-on is on"),
     PortSpec::digital_input("track-on", "Makes the output follow the track input"),
     PortSpec::analog_output("out", "", "To the actuator; its reading is what the actuator holds").required(),
+    PortSpec::analog_input(
+        "remote-sp",
+        "",
+        "Setpoint while remote-on is on; while it is bad, its last value stays",
+    ),
+    PortSpec::digital_input("remote-on", "Takes the setpoint from remote-sp, not from the loop"),
+    PortSpec::digital_input("hold", "Stops the integral"),
+    PortSpec::analog_input(
+        "reset",
+        "",
+        "External reset: what the integral follows instead of the actuator's reading",
+    ),
 ];
 
 /// Measurement.
@@ -24,6 +36,14 @@ pub const TRACK: Input = Input::of(PORTS, "track");
 pub const TRACK_ON: Input = Input::of(PORTS, "track-on");
 /// To the actuator.
 pub const OUT: Output = Output::of(PORTS, "out");
+/// Setpoint from elsewhere.
+pub const REMOTE_SP: Input = Input::of(PORTS, "remote-sp");
+/// Is it used?
+pub const REMOTE_ON: Input = Input::of(PORTS, "remote-on");
+/// Does the integral stand still?
+pub const HOLD: Input = Input::of(PORTS, "hold");
+/// What the integral follows.
+pub const RESET: Input = Input::of(PORTS, "reset");
 
 /// The parameters.
 pub const PARAMETERS: &[ParameterSpec] = &[
@@ -109,6 +129,55 @@ pub const PARAMETERS: &[ParameterSpec] = &[
         1e5,
         "Time constant of the filter on the measurement; 0 for none",
     ),
+    // Since layout 2 of the state. New ones go to the end: an older state is read by position.
+    ParameterSpec::choice(
+        "form",
+        &["standard", "series", "parallel"],
+        "What k, ti and td mean: K(1 + 1/Tis + Tds), K(1 + 1/Tis)(1 + Tds), or k + 1/(ti s) + td s",
+    ),
+    ParameterSpec::number("sp-low", "pv", -1e9, -1e9, 1e9, "Least setpoint that the law follows"),
+    ParameterSpec::number("sp-high", "pv", 1e9, -1e9, 1e9, "Greatest setpoint that the law follows"),
+    ParameterSpec::number(
+        "sp-rate",
+        "pv/s",
+        0.0,
+        0.0,
+        1e9,
+        "Greatest change of the setpoint per second; 0 for no limit",
+    ),
+    ParameterSpec::choice(
+        "sp-track",
+        &["off", "on"],
+        "on: in manual and while tracking, the setpoint of the law follows the measurement",
+    ),
+    ParameterSpec::number("hi-hi", "pv", 1e9, -1e9, 1e9, "Alarm of high priority above it; 1e9 for none"),
+    ParameterSpec::number("hi", "pv", 1e9, -1e9, 1e9, "Alarm of medium priority above it; 1e9 for none"),
+    ParameterSpec::number("lo", "pv", -1e9, -1e9, 1e9, "Alarm of medium priority below it; -1e9 for none"),
+    ParameterSpec::number("lo-lo", "pv", -1e9, -1e9, 1e9, "Alarm of high priority below it; -1e9 for none"),
+    ParameterSpec::number(
+        "dv-hi",
+        "pv",
+        1e9,
+        0.0,
+        1e9,
+        "Alarm of low priority while the measurement is so far above the setpoint; 1e9 for none",
+    ),
+    ParameterSpec::number(
+        "dv-lo",
+        "pv",
+        1e9,
+        0.0,
+        1e9,
+        "Alarm of low priority while the measurement is so far below the setpoint; 1e9 for none",
+    ),
+    ParameterSpec::number(
+        "alarm-band",
+        "pv",
+        0.0,
+        0.0,
+        1e9,
+        "How far the measurement must come back before an alarm goes",
+    ),
 ];
 
 macro_rules! handles {
@@ -148,4 +217,28 @@ handles! {
     BALANCE_TIME = "balance-time";
     /// Measurement filter.
     PV_FILTER = "pv-filter";
+    /// What k, ti and td mean.
+    FORM = "form";
+    /// Least setpoint.
+    SP_LOW = "sp-low";
+    /// Greatest setpoint.
+    SP_HIGH = "sp-high";
+    /// Rate limit of the setpoint.
+    SP_RATE = "sp-rate";
+    /// Does the setpoint follow the measurement in manual?
+    SP_TRACK = "sp-track";
+    /// Very high.
+    HI_HI = "hi-hi";
+    /// High.
+    HI = "hi";
+    /// Low.
+    LO = "lo";
+    /// Very low.
+    LO_LO = "lo-lo";
+    /// Above the setpoint.
+    DV_HI = "dv-hi";
+    /// Below the setpoint.
+    DV_LO = "dv-lo";
+    /// Hysteresis of the alarms.
+    ALARM_BAND = "alarm-band";
 }

@@ -2,7 +2,7 @@
 //!
 //! Never: a range of a single parameter; the SDK and the host check those against the table.
 
-use bumpless_sdk::{Fault, Parameters};
+use bumpless_sdk::{Fault, Parameter, Parameters};
 
 use crate::table;
 
@@ -46,24 +46,80 @@ pub struct Tuning {
     pub balance_s: f64,
     /// Time constant of the measurement filter, s.
     pub pv_filter_s: f64,
+    /// Least setpoint.
+    pub sp_low: f64,
+    /// Greatest setpoint.
+    pub sp_high: f64,
+    /// Greatest change of the setpoint per second; 0 for no limit.
+    pub sp_rate_per_s: f64,
+    /// Does the setpoint follow the measurement while something else decides the output?
+    pub sp_track: bool,
+}
+
+/// A value, or the default of the table that a state of an older layout does not have yet.
+fn value(p: &Parameters<'_>, parameter: Parameter) -> f64 {
+    let value = p.of(parameter);
+    // Values are within their ranges, so only a missing one is no number.
+    if value.is_nan() {
+        table::PARAMETERS
+            .get(parameter.index())
+            .map_or(value, |row| row.default)
+    } else {
+        value
+    }
 }
 
 impl Tuning {
-    /// From the values of the table.
+    /// A PI controller between two limits of its output; a negative gain for direct action.
+    #[must_use]
+    pub const fn pi(gain: f64, ti_s: f64, out_low: f64, out_high: f64) -> Self {
+        Self {
+            gain,
+            ti_s,
+            td_s: 0.0,
+            td_filter_s: 0.0,
+            beta: 1.0,
+            gamma: 0.0,
+            out_low,
+            out_high,
+            out_rate_per_s: 0.0,
+            dead_band: 0.0,
+            ff_gain: 1.0,
+            bias: 0.0,
+            balance_s: 60.0,
+            pv_filter_s: 0.0,
+            sp_low: -1e9,
+            sp_high: 1e9,
+            sp_rate_per_s: 0.0,
+            sp_track: false,
+        }
+    }
+
+    /// From the values of the table, of a state in any layout.
     #[must_use]
     pub fn of(p: &Parameters<'_>) -> Self {
+        Self::with_gains(p, [p.of(table::K), p.of(table::TI), p.of(table::TD)])
+    }
+
+    /// With another gain, integral and derivative time than the table's, in the table's form.
+    #[must_use]
+    pub fn with_gains(p: &Parameters<'_>, [k, ti_s, td_s]: [f64; 3]) -> Self {
+        let (k, ti_s, td_s) = match value(p, table::FORM) as u8 {
+            1 => series(k, ti_s, td_s),
+            2 => parallel(k, ti_s, td_s),
+            _ => (k, ti_s, td_s),
+        };
         let action = if p.choice(table::ACTION) == 1 {
             Action::Direct
         } else {
             Action::Reverse
         };
-        let (k, td_s) = (p.of(table::K), p.of(table::TD));
         Self {
             gain: match action {
                 Action::Reverse => k,
                 Action::Direct => -k,
             },
-            ti_s: p.of(table::TI),
+            ti_s,
             td_s,
             td_filter_s: td_s / p.of(table::N),
             beta: p.of(table::BETA),
@@ -76,15 +132,43 @@ impl Tuning {
             bias: p.of(table::BIAS),
             balance_s: p.of(table::BALANCE_TIME),
             pv_filter_s: p.of(table::PV_FILTER),
+            sp_low: value(p, table::SP_LOW),
+            sp_high: value(p, table::SP_HIGH),
+            sp_rate_per_s: value(p, table::SP_RATE),
+            sp_track: value(p, table::SP_TRACK) >= 1.0,
         }
     }
 
     /// The rules between parameters; [`Fault::BadParameter`] where one is broken.
     pub fn check(&self) -> Result<(), Fault> {
-        if self.out_low < self.out_high {
+        if self.out_low >= self.out_high {
+            return Err(Fault::bad_parameter("out-low must be less than out-high"));
+        }
+        if self.sp_low >= self.sp_high {
+            return Err(Fault::bad_parameter("sp-low must be less than sp-high"));
+        }
+        if self.td_s.is_finite() {
             Ok(())
         } else {
-            Err(Fault::bad_parameter("out-low must be less than out-high"))
+            Err(Fault::bad_parameter(
+                "k must be greater than 0 in the parallel form, or td 0",
+            ))
         }
     }
+}
+
+/// The standard form of `K(1 + 1/(Ti·s))(1 + Td·s)`, where the derivative filter is counted on its own.
+///
+/// Source: Åström and Hägglund, Advanced PID Control (ISA, 2006), sec. 3.2.
+fn series(k: f64, ti_s: f64, td_s: f64) -> (f64, f64, f64) {
+    if ti_s > 0.0 {
+        (k * (1.0 + td_s / ti_s), ti_s + td_s, ti_s * td_s / (ti_s + td_s))
+    } else {
+        (k, ti_s, td_s)
+    }
+}
+
+/// The standard form of `k + 1/(ti·s) + td·s`: an integral time for a gain of one, and so a derivative time.
+fn parallel(k: f64, ti_s: f64, td_s: f64) -> (f64, f64, f64) {
+    (k, k * ti_s, if td_s > 0.0 { td_s / k } else { 0.0 })
 }

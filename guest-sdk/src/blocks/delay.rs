@@ -31,6 +31,8 @@ pub struct Piece {
 pub struct Delay {
     time_s: f64,
     line: Vec<Piece>,
+    /// What went in last; stands in where the line is empty.
+    last: f64,
 }
 
 impl Delay {
@@ -47,6 +49,7 @@ impl Delay {
         Self {
             time_s,
             line: vec![piece; cells],
+            last: value,
         }
     }
 
@@ -62,8 +65,15 @@ impl Delay {
         &self.line
     }
 
+    /// What comes out next: the oldest value, or, without a dead time, the last one.
+    #[must_use]
+    pub fn oldest(&self) -> f64 {
+        self.line.first().map_or(self.last, |piece| piece.value)
+    }
+
     /// `value` held for the last `dt_s`, and as much time comes out, oldest first. `dt_s` > 0.
     pub fn shift(&mut self, dt_s: f64, value: f64, mut out: impl FnMut(Piece)) {
+        self.last = value;
         self.push(dt_s, value);
         self.pull(dt_s, &mut out);
     }
@@ -71,10 +81,9 @@ impl Delay {
     /// Another dead time: a longer line held its oldest value before, a shorter one forgets its oldest pieces.
     pub fn stretch(&mut self, time_s: f64) {
         if time_s > self.time_s {
-            let oldest = self.line.first().map_or(0.0, |p| p.value);
             let before = Piece {
                 for_s: time_s - self.time_s,
-                value: oldest,
+                value: self.oldest(),
             };
             self.line.insert(0, before);
         } else {
@@ -107,7 +116,6 @@ impl Delay {
                     });
                     piece.for_s -= left_s;
                 }
-                left_s = 0.0;
                 break;
             }
             out(*piece);

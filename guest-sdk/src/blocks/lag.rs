@@ -34,10 +34,20 @@ impl LeadLag {
         }
     }
 
+    /// `value` held for some time.
+    pub fn advance(&mut self, value: f64, lag_s: f64, for_s: f64) {
+        self.lagged += (value - self.lagged) * lag_part(lag_s, for_s);
+    }
+
+    /// The input from now on.
+    pub const fn set(&mut self, input: f64) {
+        self.input = input;
+    }
+
     /// One step: `dt_s` since the one before, and the input from now on.
     pub fn step(&mut self, input: f64, lead_s: f64, lag_s: f64, dt_s: f64) -> f64 {
-        self.lagged += (self.input - self.lagged) * lag_part(lag_s, dt_s);
-        self.input = input;
+        self.advance(self.input, lag_s, dt_s);
+        self.set(input);
         self.output(lead_s, lag_s)
     }
 }

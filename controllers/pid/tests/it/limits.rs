@@ -18,10 +18,15 @@ fn parameters() -> impl Strategy<Value = Vec<(&'static str, f64)>> {
         .collect();
     rows.prop_map(|mut values| {
         let at = |values: &[(&str, f64)], name| values.iter().position(|(n, _)| *n == name).expect("is in the table");
-        let (low, high) = (at(&values, "out-low"), at(&values, "out-high"));
-        if values[low].1 >= values[high].1 {
-            values[high].1 = values[low].1 + 1.0;
+        for (low, high) in [("out-low", "out-high"), ("sp-low", "sp-high")] {
+            let (low, high) = (at(&values, low), at(&values, high));
+            if values[low].1 >= values[high].1 {
+                values[high].1 = values[low].1 + 1.0;
+            }
         }
+        // A parallel form without a gain has no standard one.
+        let k = at(&values, "k");
+        values[k].1 = values[k].1.max(1e-3);
         values
     })
 }

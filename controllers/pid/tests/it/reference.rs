@@ -5,7 +5,7 @@
 //! and PID controller tuning* (J. Process Control 13, 2003). The exact oracle: for any stable loop with integral action in the
 //! standard form, a unit step load costs `∫e dt = Ti/K`.
 
-use bumpless_isa::{Demand, Memory, Sample, Tuning};
+use bumpless_isa::{Memory, Sample, Tuning};
 
 use crate::plant::{Kind, Plant};
 
@@ -13,22 +13,7 @@ use crate::plant::{Kind, Plant};
 const DT_S: f64 = 0.000_5;
 
 fn pi(k: f64, ti_s: f64) -> Tuning {
-    Tuning {
-        gain: k,
-        ti_s,
-        td_s: 0.0,
-        td_filter_s: 0.0,
-        beta: 1.0,
-        gamma: 0.0,
-        out_low: -1e9,
-        out_high: 1e9,
-        out_rate_per_s: 0.0,
-        dead_band: 0.0,
-        ff_gain: 0.0,
-        bias: 0.0,
-        balance_s: 0.0,
-        pv_filter_s: 0.0,
-    }
+    Tuning::pi(k, ti_s, -1e9, 1e9)
 }
 
 #[derive(Debug, Default)]
@@ -42,15 +27,7 @@ struct Indices {
 /// Runs a loop from rest with a step of the setpoint or of the load.
 fn respond(t: &Tuning, mut plant: Plant, setpoint: f64, load: f64, horizon_s: f64) -> Indices {
     let mut memory = Memory::new(0.0);
-    let mut sample = Sample {
-        pv: 0.0,
-        setpoint: 0.0,
-        feedforward: 0.0,
-        held: Some(0.0),
-        demand: Demand::Automatic,
-        dt_s: DT_S,
-        elapsed_s: Some(DT_S),
-    };
+    let mut sample = Sample::automatic(0.0, 0.0, Some(0.0), DT_S);
     // At rest; the first step only takes over.
     let mut out = memory.step(t, &sample);
     assert_eq!(out, 0.0);
@@ -263,15 +240,7 @@ fn direct_action_is_reverse_action_on_an_inverted_plant() {
     let mut plant = Plant::new(Kind::Lags(vec![1.0]), 1.0, DT_S);
     let (mut out, mut iae, mut setpoint) = (0.0, 0.0, 0.0);
     for _ in 0..=(20.0 / DT_S) as usize {
-        let sample = Sample {
-            pv: -plant.output(),
-            setpoint,
-            feedforward: 0.0,
-            held: Some(out),
-            demand: Demand::Automatic,
-            dt_s: DT_S,
-            elapsed_s: Some(DT_S),
-        };
+        let sample = Sample::automatic(-plant.output(), setpoint, Some(out), DT_S);
         out = memory.step(&t, &sample);
         if setpoint != 0.0 {
             iae += (setpoint - sample.pv).abs() * DT_S;
