@@ -19,8 +19,24 @@ use crate::{
 const LIMIT_NS: u64 = 1_000_000_000;
 /// Rounds of which the median is told.
 const ROUNDS: usize = 9;
-/// Components against which the native law is held; the first is the same law.
-const COMPONENTS: [&str; 3] = ["pid", "pidplus", "on-off"];
+/// Components against which the native law is held: all stock laws. The first is the same law.
+const COMPONENTS: [&str; 15] = [
+    "pid",
+    "pidplus",
+    "on-off",
+    "cascade",
+    "ratio",
+    "split-range",
+    "feedforward",
+    "lead-lag",
+    "override-selector",
+    "gain-schedule",
+    "smith",
+    "fuzzy",
+    "kalman-pid",
+    "mpc",
+    "autotune",
+];
 
 type Law = fn(&mut Memory, &Tuning, &Sample) -> f64;
 

@@ -16,7 +16,7 @@ use serde_json::Value;
 const LINES_MAX: usize = 600;
 
 /// What each room may use of the others. Nothing imports upwards; `io engine store cell` never import each other.
-const ROOMS: [(&str, &[&str]); 18] = [
+const ROOMS: [(&str, &[&str]); 29] = [
     ("bumpless-core", &[]),
     ("bumpless-io", &["bumpless-core"]),
     ("bumpless-engine", &["bumpless-core"]),
@@ -57,6 +57,17 @@ const ROOMS: [(&str, &[&str]); 18] = [
     ("bumpless-pidplus", &["bumpless-isa", "bumpless-sdk"]),
     ("bumpless-on-off", &["bumpless-sdk"]),
     ("bumpless-cascade", &["bumpless-isa", "bumpless-sdk"]),
+    ("bumpless-autotune", &["bumpless-isa", "bumpless-sdk"]),
+    ("bumpless-feedforward", &["bumpless-isa", "bumpless-sdk"]),
+    ("bumpless-fuzzy", &["bumpless-isa", "bumpless-sdk"]),
+    ("bumpless-gain-schedule", &["bumpless-isa", "bumpless-sdk"]),
+    ("bumpless-kalman-pid", &["bumpless-isa", "bumpless-sdk"]),
+    ("bumpless-lead-lag", &["bumpless-isa", "bumpless-sdk"]),
+    ("bumpless-mpc", &["bumpless-isa", "bumpless-sdk"]),
+    ("bumpless-override-selector", &["bumpless-isa", "bumpless-sdk"]),
+    ("bumpless-ratio", &["bumpless-isa", "bumpless-sdk"]),
+    ("bumpless-smith", &["bumpless-isa", "bumpless-sdk"]),
+    ("bumpless-split-range", &["bumpless-isa", "bumpless-sdk"]),
     ("bumpless-model", &["bumpless-core"]),
     ("bumpless-simulation", &["bumpless-core"]),
     ("xtask", &["bumpless-core"]),

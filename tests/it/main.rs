@@ -15,6 +15,7 @@
 //! | neighbours | two cells on one machine |
 //! | watching | metrics, the document of the API, the live feed |
 //! | library | trials, labels, bundles, bombs and crowds of components |
+//! | stock | every stock law passes its trial |
 //! | guides | the commands in the documentation |
 //! | house | the rules of the source itself |
 
@@ -37,6 +38,7 @@ mod neighbours;
 mod refusals;
 mod restarts;
 mod rollouts;
+mod stock;
 mod story;
 mod votes;
 mod watching;

@@ -458,7 +458,26 @@ mod tests {
     fn components_are_built_once_and_import_only_what_the_host_gives() {
         let (folder, first) = build_all().expect("components build");
         let names: Vec<&str> = first.iter().filter(|c| !c.guest).map(|c| c.name.as_str()).collect();
-        assert_eq!(names, ["cascade", "on-off", "pid", "pidplus"]);
+        assert_eq!(
+            names,
+            [
+                "autotune",
+                "cascade",
+                "feedforward",
+                "fuzzy",
+                "gain-schedule",
+                "kalman-pid",
+                "lead-lag",
+                "mpc",
+                "on-off",
+                "override-selector",
+                "pid",
+                "pidplus",
+                "ratio",
+                "smith",
+                "split-range"
+            ]
+        );
         assert!(first.iter().any(|c| c.guest && c.name == "traps"));
         for component in &first {
             let bytes = fs::read(&component.path).expect("is there");

@@ -174,7 +174,11 @@ impl Relay {
         }
         self.low = self.low.min(pv);
         self.peak = self.peak.max(pv);
-        let above = if b.direct { self.reference - pv } else { pv - self.reference };
+        let above = if b.direct {
+            self.reference - pv
+        } else {
+            pv - self.reference
+        };
         if self.high && above > b.noise {
             self.high = false;
         } else if !self.high && above < -b.noise {
@@ -330,7 +334,10 @@ impl Up {
         let t = self.time_s;
         let residence_s = t - self.area / change;
         let second = 0.5 * t * t - self.moment / change;
-        let lag_s = (2.0 * second - residence_s * residence_s).max(0.0).sqrt().min(residence_s.max(0.0));
+        let lag_s = (2.0 * second - residence_s * residence_s)
+            .max(0.0)
+            .sqrt()
+            .min(residence_s.max(0.0));
         Ok(Finding::Process {
             gain: change / b.amplitude,
             lag_s,
@@ -400,16 +407,21 @@ mod tests {
         for (gain, lag_s, delay_s) in [(2.0, 10.0, 3.0), (0.5, 20.0, 1.0), (1.0, 4.0, 8.0)] {
             let mut process = Process::new(gain, lag_s, delay_s);
             let mut step = Step::new(40.0, process.y);
-            let bounds = Bounds {
-                noise: 0.002,
-                ..BOUNDS
-            };
+            let bounds = Bounds { noise: 0.002, ..BOUNDS };
             let found = run(|pv| step.step(&bounds, pv, DT_S), &mut process, 5.0);
-            let Ok(Finding::Process { gain: k, lag_s: t, delay_s: l }) = found else {
+            let Ok(Finding::Process {
+                gain: k,
+                lag_s: t,
+                delay_s: l,
+            }) = found
+            else {
                 panic!("{found:?}");
             };
             assert!((k - gain).abs() < 0.02 * gain, "{k}");
-            assert!((t - lag_s).abs() < 0.1 * lag_s && (l - delay_s).abs() < 0.1 * (lag_s + delay_s), "{t} {l}");
+            assert!(
+                (t - lag_s).abs() < 0.1 * lag_s && (l - delay_s).abs() < 0.1 * (lag_s + delay_s),
+                "{t} {l}"
+            );
         }
     }
 
@@ -440,14 +452,23 @@ mod tests {
             time_max_s: 5.0,
             ..BOUNDS
         };
-        assert_eq!(run(|pv| relay.step(&short, pv, DT_S), &mut process, 5.0), Err(Failure::Time));
+        assert_eq!(
+            run(|pv| relay.step(&short, pv, DT_S), &mut process, 5.0),
+            Err(Failure::Time)
+        );
         let mut process = Process::new(2.0, 10.0, 3.0);
         let mut step = Step::new(40.0, process.y);
         let narrow = Bounds { pv_span: 4.0, ..BOUNDS };
-        assert_eq!(run(|pv| step.step(&narrow, pv, DT_S), &mut process, 5.0), Err(Failure::Span));
+        assert_eq!(
+            run(|pv| step.step(&narrow, pv, DT_S), &mut process, 5.0),
+            Err(Failure::Span)
+        );
         let mut process = Process::new(-2.0, 10.0, 3.0);
         let mut step = Step::new(40.0, process.y);
-        assert_eq!(run(|pv| step.step(&BOUNDS, pv, DT_S), &mut process, 5.0), Err(Failure::Direction));
+        assert_eq!(
+            run(|pv| step.step(&BOUNDS, pv, DT_S), &mut process, 5.0),
+            Err(Failure::Direction)
+        );
     }
 
     #[test]

@@ -41,9 +41,30 @@ pub const PARAMETERS: &[ParameterSpec] = &joined::<_, { table::PARAMETERS.len() 
             "Begins an experiment when it goes to one; off ends it",
         ),
         ParameterSpec::choice("apply", &["no", "yes"], "yes: the PID uses what was found"),
-        ParameterSpec::number("amplitude", "out", 5.0, 1e-6, 1e9, "How far an experiment moves the output"),
-        ParameterSpec::number("noise", "pv", 0.1, 0.0, 1e9, "Half width of what the measurement does by itself"),
-        ParameterSpec::number("pv-span", "pv", 10.0, 1e-9, 1e9, "How far an experiment may move the measurement"),
+        ParameterSpec::number(
+            "amplitude",
+            "out",
+            5.0,
+            1e-6,
+            1e9,
+            "How far an experiment moves the output",
+        ),
+        ParameterSpec::number(
+            "noise",
+            "pv",
+            0.1,
+            0.0,
+            1e9,
+            "Half width of what the measurement does by itself",
+        ),
+        ParameterSpec::number(
+            "pv-span",
+            "pv",
+            10.0,
+            1e-9,
+            1e9,
+            "How far an experiment may move the measurement",
+        ),
         ParameterSpec::number("time-max", "s", 1800.0, 1.0, 1e6, "Longest time of an experiment"),
         ParameterSpec::number(
             "quiet-time",
@@ -63,7 +84,14 @@ pub const PARAMETERS: &[ParameterSpec] = &joined::<_, { table::PARAMETERS.len() 
             ],
             "Relay: from swing to tuning",
         ),
-        ParameterSpec::number("tau-c", "", 1.0, 0.1, 100.0, "Step: closed-loop time of SIMC, in dead times"),
+        ParameterSpec::number(
+            "tau-c",
+            "",
+            1.0,
+            0.1,
+            100.0,
+            "Step: closed-loop time of SIMC, in dead times",
+        ),
     ],
 );
 const fn row(name: &str) -> Parameter {
@@ -185,20 +213,16 @@ impl State {
         self.under_way = None;
         self.last = Some(end);
         match end {
-            Ok(_) => io.log(Level::Info, "the experiment is done: its tuning is at the outputs found-k, -ti and -td"),
+            Ok(_) => io.log(
+                Level::Info,
+                "the experiment is done: its tuning is at the outputs found-k, -ti and -td",
+            ),
             Err(failure) => io.log(Level::Warning, words(failure)),
         }
     }
 
     /// Begins, goes on or ends. Gives the output that the experiment wants, while it is under way.
-    fn experiment(
-        &mut self,
-        p: &Parameters<'_>,
-        demand: Demand,
-        pv: f64,
-        dt_s: f64,
-        io: &mut Io<'_>,
-    ) -> Option<f64> {
+    fn experiment(&mut self, p: &Parameters<'_>, demand: Demand, pv: f64, dt_s: f64, io: &mut Io<'_>) -> Option<f64> {
         let wanted = u8::try_from(p.choice(TUNE)).unwrap_or(0);
         let is_new = wanted != self.asked;
         let free = demand == Demand::Automatic;
@@ -366,10 +390,16 @@ mod tests {
             let wish: Vec<_> = base.iter().chain(&[("tune", tune)]).copied().collect();
             bench.retune(&wish).unwrap();
             let outputs = run(&mut bench, &mut process, 3000);
-            assert!(outputs.iter().all(|out| (out - 50.0).abs() < 6.0), "limits of the experiment");
+            assert!(
+                outputs.iter().all(|out| (out - 50.0).abs() < 6.0),
+                "limits of the experiment"
+            );
             assert_eq!(bench.written(STAGE), Some(2.0));
             let found = FOUND.map(|port| bench.written(port).unwrap());
-            assert!((0.5..3.0).contains(&found[0]) && (5.0..40.0).contains(&found[1]), "{found:?}");
+            assert!(
+                (0.5..3.0).contains(&found[0]) && (5.0..40.0).contains(&found[1]),
+                "{found:?}"
+            );
             let before = *outputs.last().unwrap();
             let wish: Vec<_> = wish.iter().chain(&[("apply", 1.0)]).copied().collect();
             bench.retune(&wish).unwrap();

@@ -1,6 +1,6 @@
 //! The component `cascade`: glue between the SDK and two blocks of the ISA standard form, one inside the other (`law.rs`).
 //!
-//! README.md has the ports, parameters and the picture. Never: arithmetic.
+//! docs/laws.md has the ports, parameters and the picture. Never: arithmetic.
 
 pub mod law;
 
@@ -84,7 +84,14 @@ const PARAMETERS: &[ParameterSpec] = &[
         100.0,
         "Derivative filter of both: its time is the derivative time / n",
     ),
-    ParameterSpec::number("beta", "", 1.0, 0.0, 1.0, "Part of the setpoint in the outer proportional action"),
+    ParameterSpec::number(
+        "beta",
+        "",
+        1.0,
+        0.0,
+        1.0,
+        "Part of the setpoint in the outer proportional action",
+    ),
     ParameterSpec::number(
         "inner-beta",
         "",

@@ -130,3 +130,33 @@ fn what_cannot_be_is_refused() {
     bench.set(PV, 1.0);
     assert!(format!("{:?}", bench.step(0.1).unwrap_err()).contains("inner-pv"));
 }
+
+#[test]
+fn the_inner_loop_alone_and_back_to_the_cascade_do_not_bump() {
+    use bumpless_cascade::{INNER_ON, INNER_SP, INNER_SP_OUT};
+
+    let (mut bench, mut process) = at_rest(40.0);
+    run(&mut bench, &mut process, 42.0, 0.0, 5.0);
+    let (out, inner_sp) = (bench.wanted()[0], bench.written(INNER_SP_OUT).unwrap());
+    bench.set(INNER_ON, 1.0);
+    run(&mut bench, &mut process, 42.0, 0.0, 0.1);
+    assert!((bench.wanted()[0] - out).abs() < 0.5, "the inner setpoint stays");
+    assert!((bench.written(INNER_SP_OUT).unwrap() - inner_sp).abs() < 1e-9);
+    bench.set(INNER_SP, 60.0);
+    run(&mut bench, &mut process, 42.0, 0.0, 60.0);
+    assert!(
+        (process.inner - 60.0).abs() < 0.01,
+        "its own setpoint is reached: {}",
+        process.inner
+    );
+    let before = bench.wanted()[0];
+    bench.set(INNER_ON, 0.0);
+    run(&mut bench, &mut process, 42.0, 0.0, 0.1);
+    let after = bench.wanted()[0];
+    assert!(
+        (after - before).abs() < 0.01,
+        "back in the cascade from there: {before} and {after}"
+    );
+    run(&mut bench, &mut process, 42.0, 0.0, 200.0);
+    assert!((process.outer - 42.0).abs() < 0.05, "{}", process.outer);
+}

@@ -88,7 +88,10 @@ mod tests {
         for i in 0..4 {
             assert!((path.step(&d, Some(4.0), 0.25) - 3.0).abs() < 1e-12, "{i}");
         }
-        assert!((path.step(&d, Some(4.0), 0.25) - 5.0).abs() < 1e-12, "a second later, twice");
+        assert!(
+            (path.step(&d, Some(4.0), 0.25) - 5.0).abs() < 1e-12,
+            "a second later, twice"
+        );
         for i in 1..20 {
             let expected = 4.0 + (-0.125 * f64::from(i)).exp();
             assert!((path.step(&d, None, 0.25) - expected).abs() < 1e-9, "{i}");

@@ -17,8 +17,22 @@ use serde::{Deserialize, Serialize};
 pub const PARAMETERS: &[ParameterSpec] = &joined::<_, { table::PARAMETERS.len() + 3 }>(
     table::PARAMETERS,
     &[
-        ParameterSpec::number("ff-lead", "s", 0.0, 0.0, 1e6, "Time constant of the lead of the feedforward"),
-        ParameterSpec::number("ff-lag", "s", 0.0, 0.0, 1e6, "Time constant of the lag of the feedforward"),
+        ParameterSpec::number(
+            "ff-lead",
+            "s",
+            0.0,
+            0.0,
+            1e6,
+            "Time constant of the lead of the feedforward",
+        ),
+        ParameterSpec::number(
+            "ff-lag",
+            "s",
+            0.0,
+            0.0,
+            1e6,
+            "Time constant of the lag of the feedforward",
+        ),
         ParameterSpec::number("ff-delay", "s", 0.0, 0.0, 1e5, "Dead time of the feedforward"),
     ],
 );

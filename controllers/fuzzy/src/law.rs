@@ -114,7 +114,11 @@ pub fn infer(error: f64, rate: f64) -> f64 {
 fn centroid(strength: &[f64; SETS]) -> f64 {
     let (mut area, mut moment) = (0.0, 0.0);
     for cell in 0..=SETS {
-        let h = cell.checked_sub(1).and_then(|i| strength.get(i)).copied().unwrap_or(0.0);
+        let h = cell
+            .checked_sub(1)
+            .and_then(|i| strength.get(i))
+            .copied()
+            .unwrap_or(0.0);
         let g = strength.get(cell).copied().unwrap_or(0.0);
         let at = |t: f64| h.min(1.0 - t).max(g.min(t));
         let mut corners = [0.0, 1.0 - h, h, g, 1.0 - g, 0.5, 1.0];
@@ -232,7 +236,10 @@ mod tests {
         let (n, mut area, mut moment) = (200_000, 0.0, 0.0);
         for i in 0..n {
             let x = -1.5 + 3.0 * (f64::from(i) + 0.5) / f64::from(n);
-            let y = (1.0 - 2.0 * x.abs()).min(0.8).max((1.0 - 2.0 * (x - 0.5).abs()).min(0.2)).max(0.0);
+            let y = (1.0 - 2.0 * x.abs())
+                .min(0.8)
+                .max((1.0 - 2.0 * (x - 0.5).abs()).min(0.2))
+                .max(0.0);
             area += y;
             moment += x * y;
         }

@@ -26,9 +26,23 @@ pub const PARAMETERS: &[ParameterSpec] = &[
         1e9,
         "Rate of the error that counts as big",
     ),
-    ParameterSpec::number("out-span", "out", 20.0, 0.0, 1e9, "What the rules add to the output at most"),
+    ParameterSpec::number(
+        "out-span",
+        "out",
+        20.0,
+        0.0,
+        1e9,
+        "What the rules add to the output at most",
+    ),
     ParameterSpec::number("ti", "s", 60.0, 0.0, 1e6, "Integral time; 0 for no integral action"),
-    ParameterSpec::number("rate-filter", "s", 1.0, 0.0, 1e5, "Time constant of the filter on the rate"),
+    ParameterSpec::number(
+        "rate-filter",
+        "s",
+        1.0,
+        0.0,
+        1e5,
+        "Time constant of the filter on the rate",
+    ),
     ParameterSpec::choice(
         "action",
         &["reverse", "direct"],
@@ -169,7 +183,12 @@ mod tests {
         out
     }
 
-    const TUNING: [(&str, f64); 4] = [("ti", 10.0), ("error-span", 10.0), ("rate-span", 4.0), ("out-span", 20.0)];
+    const TUNING: [(&str, f64); 4] = [
+        ("ti", 10.0),
+        ("error-span", 10.0),
+        ("rate-span", 4.0),
+        ("out-span", 20.0),
+    ];
 
     #[test]
     fn it_starts_settles_and_does_not_wind_up() {
@@ -190,7 +209,9 @@ mod tests {
         let mut y = 40.0;
         run(&mut bench, &mut y, 47.0, 5);
         let before = bench.wanted()[0];
-        bench.retune(&[("out-span", 90.0), ("error-span", 3.0), ("ti", 5.0)]).unwrap();
+        bench
+            .retune(&[("out-span", 90.0), ("error-span", 3.0), ("ti", 5.0)])
+            .unwrap();
         let after = bench.step(1e-9).unwrap()[0];
         assert!((after - before).abs() < 1e-3, "{before} and {after}");
         bench.set_reading(PV, Some(bad(1.0)));

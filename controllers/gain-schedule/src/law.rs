@@ -32,7 +32,9 @@ impl Schedule {
     pub fn check(&self) -> Result<(), Fault> {
         let used = || self.at.iter().zip(&self.gains).take(self.count);
         if used().zip(used().skip(1)).any(|((a, _), (b, _))| a >= b) {
-            return Err(Fault::bad_parameter("x1 < x2 < x3 < x4 must hold for the points that count"));
+            return Err(Fault::bad_parameter(
+                "x1 < x2 < x3 < x4 must hold for the points that count",
+            ));
         }
         let integrating = used().filter(|(_, [_, ti, _])| *ti > 0.0).count();
         if integrating == 0 || integrating == self.count {

@@ -134,12 +134,7 @@ impl Controller for GainSchedule {
         Ok(())
     }
 
-    fn retune(
-        state: &mut Scheduled,
-        old: &Parameters<'_>,
-        new: &Parameters<'_>,
-        _: &Track<'_>,
-    ) -> Result<(), Fault> {
+    fn retune(state: &mut Scheduled, old: &Parameters<'_>, new: &Parameters<'_>, _: &Track<'_>) -> Result<(), Fault> {
         check(new)?;
         let at = |p: &Parameters<'_>| state.value.map_or_else(|| Tuning::of(p), |value| tuning(p, value));
         let (before, now) = (at(old), at(new));
@@ -165,7 +160,14 @@ mod tests {
 
     use super::*;
 
-    const TABLE: [(&str, f64); 6] = [("k", 1.0), ("ti", 20.0), ("x2", 10.0), ("k2", 5.0), ("ti2", 4.0), ("td2", 1.0)];
+    const TABLE: [(&str, f64); 6] = [
+        ("k", 1.0),
+        ("ti", 20.0),
+        ("x2", 10.0),
+        ("k2", 5.0),
+        ("ti2", 4.0),
+        ("td2", 1.0),
+    ];
 
     fn start() -> Bench<GainSchedule> {
         let mut bench = Bench::start(&TABLE, &[40.0]).unwrap();
@@ -194,7 +196,9 @@ mod tests {
     #[test]
     fn with_one_point_it_is_a_pid_bit_by_bit() {
         let given = [("k", 3.0), ("ti", 8.0), ("td", 1.5)];
-        let mut pid = Bench::<GainSchedule>::start(&[("points", 1.0), ("by", 1.0), given[0], given[1], given[2]], &[40.0]).unwrap();
+        let mut pid =
+            Bench::<GainSchedule>::start(&[("points", 1.0), ("by", 1.0), given[0], given[1], given[2]], &[40.0])
+                .unwrap();
         let mut memory = bumpless_isa::Memory::new(40.0);
         let tuning = Tuning {
             td_s: 1.5,
@@ -219,7 +223,9 @@ mod tests {
         let mut bench = start();
         bench.set(SCHEDULE, 7.0);
         let before = (0..20).fold(0.0, |_, _| bench.step(0.1).unwrap()[0]);
-        bench.retune(&[("k", 9.0), ("ti", 3.0), ("x2", 8.0), ("k2", 0.5), ("ti2", 50.0)]).unwrap();
+        bench
+            .retune(&[("k", 9.0), ("ti", 3.0), ("x2", 8.0), ("k2", 0.5), ("ti2", 50.0)])
+            .unwrap();
         let after = bench.step(1e-9).unwrap()[0];
         assert!((after - before).abs() < 1e-6);
         bench.set_mode(Mode::Manual);

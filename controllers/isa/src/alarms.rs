@@ -27,24 +27,42 @@ enum Side {
 }
 
 const WATCHES: [Watch; 6] = [
-    watch("hi-hi", "the measurement is above hi-hi", Priority::High, HI_HI, Side::Above),
+    watch(
+        "hi-hi",
+        "the measurement is above hi-hi",
+        Priority::High,
+        HI_HI,
+        Side::Above,
+    ),
     watch("hi", "the measurement is above hi", Priority::Medium, HI, Side::Above),
     watch("lo", "the measurement is below lo", Priority::Medium, LO, Side::Below),
-    watch("lo-lo", "the measurement is below lo-lo", Priority::High, LO_LO, Side::Below),
-    watch("dv-hi", "the measurement is far above the setpoint", Priority::Low, DV_HI, Side::AboveSetpoint),
-    watch("dv-lo", "the measurement is far below the setpoint", Priority::Low, DV_LO, Side::BelowSetpoint),
+    watch(
+        "lo-lo",
+        "the measurement is below lo-lo",
+        Priority::High,
+        LO_LO,
+        Side::Below,
+    ),
+    watch(
+        "dv-hi",
+        "the measurement is far above the setpoint",
+        Priority::Low,
+        DV_HI,
+        Side::AboveSetpoint,
+    ),
+    watch(
+        "dv-lo",
+        "the measurement is far below the setpoint",
+        Priority::Low,
+        DV_LO,
+        Side::BelowSetpoint,
+    ),
 ];
 
 /// A limit of this size is none.
 const NONE: f64 = 1e9;
 
-const fn watch(
-    name: &'static str,
-    text: &'static str,
-    priority: Priority,
-    limit: Parameter,
-    side: Side,
-) -> Watch {
+const fn watch(name: &'static str, text: &'static str, priority: Priority, limit: Parameter, side: Side) -> Watch {
     Watch {
         name,
         text,

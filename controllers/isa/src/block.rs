@@ -10,9 +10,7 @@ use bumpless_sdk::prelude::*;
 use crate::{
     alarms,
     law::{Demand, Memory, Memory1, Sample},
-    table::{
-        FF, HOLD, OUT, PARAMETERS, PORTS, PV, REMOTE_ON, REMOTE_SP, RESET, TRACK, TRACK_ON,
-    },
+    table::{FF, HOLD, OUT, PARAMETERS, PORTS, PV, REMOTE_ON, REMOTE_SP, RESET, TRACK, TRACK_ON},
     tuning::Tuning,
 };
 
@@ -167,13 +165,7 @@ pub fn is_on(io: &Io<'_>, input: Input) -> bool {
 /// In manual the law follows the actuator; with track-on it follows the track input, or, where that fails, the actuator.
 /// `last` stands in for an actuator that cannot be read.
 #[must_use]
-pub fn demand(
-    last: f64,
-    cycle: &Cycle,
-    io: &Io<'_>,
-    held: Option<f64>,
-    (track, track_on): (Input, Input),
-) -> Demand {
+pub fn demand(last: f64, cycle: &Cycle, io: &Io<'_>, held: Option<f64>, (track, track_on): (Input, Input)) -> Demand {
     let held = held.unwrap_or(last);
     if matches!(cycle.mode, Mode::Manual) {
         Demand::Follow(held)

@@ -190,7 +190,15 @@ mod tests {
             ..LIMITS
         };
         assert_eq!(station.step(0.0, &slow, Demand::Automatic, 100.0, 0.5), 99.0);
-        assert!(Limits { low: 3.0, high: 3.0, ..LIMITS }.check().is_err());
+        assert!(
+            Limits {
+                low: 3.0,
+                high: 3.0,
+                ..LIMITS
+            }
+            .check()
+            .is_err()
+        );
     }
 
     #[test]

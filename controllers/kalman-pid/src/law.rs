@@ -53,14 +53,11 @@ impl Filter {
     /// `held` was the actuator's value for the last `dt_s`; `fresh` says whether `pv` is a new measurement.
     pub fn step(&mut self, m: &Model, held: f64, pv: f64, fresh: bool, dt_s: f64) -> &Estimate {
         let variance = m.noise * m.noise;
-        match &mut self.estimate {
-            Some(estimate) => {
-                estimate.predict(m, held, dt_s);
-                if fresh {
-                    estimate.update(pv, variance);
-                }
+        if let Some(estimate) = &mut self.estimate {
+            estimate.predict(m, held, dt_s);
+            if fresh {
+                estimate.update(pv, variance);
             }
-            None => {}
         }
         self.estimate.get_or_insert_with(|| Estimate {
             x: pv,

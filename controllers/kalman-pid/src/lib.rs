@@ -51,7 +51,14 @@ pub const PARAMETERS: &[ParameterSpec] = &joined::<_, { table::PARAMETERS.len() 
             1e9,
             "Standard deviation that the process gains by itself in 1 s",
         ),
-        ParameterSpec::number("drift", "pv", 0.1, 0.0, 1e9, "Standard deviation that the load gains in 1 s"),
+        ParameterSpec::number(
+            "drift",
+            "pv",
+            0.1,
+            0.0,
+            1e9,
+            "Standard deviation that the load gains in 1 s",
+        ),
     ],
 );
 /// The estimate.

@@ -264,7 +264,13 @@ impl Program {
                 self.row(at(j, 1.0), reach);
                 self.row(at(j, -1.0), reach);
             }
-            let slower = |room: f64| if reach > 0.0 { room.max(-0.99 * reach * (j + 1) as f64) } else { room };
+            let slower = |room: f64| {
+                if reach > 0.0 {
+                    room.max(-0.99 * reach * (j + 1) as f64)
+                } else {
+                    room
+                }
+            };
             self.row(upto(j, 1.0), slower(t.out_high - held));
             self.row(upto(j, -1.0), slower(held - t.out_low));
         }

@@ -66,8 +66,22 @@ pub const PARAMETERS: &[ParameterSpec] = &[
         1e9,
         "Greatest change of the output per second; 0 for no limit",
     ),
-    ParameterSpec::number("pv-low", "pv", -1e9, -1e9, 1e9, "Least measurement, kept as well as can be; -1e9 for none"),
-    ParameterSpec::number("pv-high", "pv", 1e9, -1e9, 1e9, "Greatest measurement, kept as well as can be; 1e9 for none"),
+    ParameterSpec::number(
+        "pv-low",
+        "pv",
+        -1e9,
+        -1e9,
+        1e9,
+        "Least measurement, kept as well as can be; -1e9 for none",
+    ),
+    ParameterSpec::number(
+        "pv-high",
+        "pv",
+        1e9,
+        -1e9,
+        1e9,
+        "Greatest measurement, kept as well as can be; 1e9 for none",
+    ),
 ];
 /// Measurement.
 pub const PV: Input = Input::of(PORTS, "pv");
@@ -297,7 +311,10 @@ mod tests {
             (vec![("out-low", 100.0)], "out-low"),
         ] {
             let error = Bench::<Mpc>::start(&given, &[0.0]).unwrap_err();
-            assert!(matches!(&error, Fault::BadParameter(text) if text.contains(part)), "{error:?}");
+            assert!(
+                matches!(&error, Fault::BadParameter(text) if text.contains(part)),
+                "{error:?}"
+            );
         }
     }
 }

@@ -238,7 +238,10 @@ mod tests {
             b: vec![],
         };
         let x = free.solve().unwrap();
-        assert!((x[0] - 1.0 / 11.0).abs() < 1e-9 && (x[1] - 7.0 / 11.0).abs() < 1e-9, "{x:?}");
+        assert!(
+            (x[0] - 1.0 / 11.0).abs() < 1e-9 && (x[1] - 7.0 / 11.0).abs() < 1e-9,
+            "{x:?}"
+        );
         let bad = Program {
             h: vec![1.0, 0.0, 0.0, -1.0],
             ..free

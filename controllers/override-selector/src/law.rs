@@ -86,7 +86,10 @@ mod tests {
         ] {
             let mut pair = Pair::new(0.0);
             assert_eq!(pair.take(select, main, limit), taken);
-            assert_eq!((pair.limited, pair.main.output, pair.limit.output), (limited, taken, taken));
+            assert_eq!(
+                (pair.limited, pair.main.output, pair.limit.output),
+                (limited, taken, taken)
+            );
         }
     }
 

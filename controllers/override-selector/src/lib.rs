@@ -24,7 +24,11 @@ pub const PORTS: &[PortSpec] = &joined::<_, { table::PORTS.len() + 2 }>(
 pub const PARAMETERS: &[ParameterSpec] = &joined::<_, { table::PARAMETERS.len() + 6 }>(
     table::PARAMETERS,
     &[
-        ParameterSpec::choice("select", &["low", "high"], "Which wish counts: the lower or the higher one"),
+        ParameterSpec::choice(
+            "select",
+            &["low", "high"],
+            "Which wish counts: the lower or the higher one",
+        ),
         ParameterSpec::number("limit-sp", "limit-pv", 100.0, -1e9, 1e9, "The limit"),
         ParameterSpec::number("limit-k", "out/limit-pv", 1.0, 0.0, 1e6, "Gain of the limit's block"),
         ParameterSpec::number("limit-ti", "s", 60.0, 0.0, 1e6, "Its integral time; 0 for none"),
@@ -70,7 +74,11 @@ fn limit_tuning(p: &Parameters<'_>, main: &Tuning) -> Tuning {
 }
 
 fn select(p: &Parameters<'_>) -> Select {
-    if p.choice(SELECT) == 1 { Select::High } else { Select::Low }
+    if p.choice(SELECT) == 1 {
+        Select::High
+    } else {
+        Select::Low
+    }
 }
 
 impl Controller for OverrideSelector {
@@ -155,7 +163,13 @@ mod tests {
 
     use super::*;
 
-    const TUNING: [(&str, f64); 5] = [("k", 2.0), ("ti", 10.0), ("limit-k", 0.5), ("limit-ti", 2.0), ("limit-sp", 100.0)];
+    const TUNING: [(&str, f64); 5] = [
+        ("k", 2.0),
+        ("ti", 10.0),
+        ("limit-k", 0.5),
+        ("limit-ti", 2.0),
+        ("limit-sp", 100.0),
+    ];
 
     #[test]
     fn it_starts_and_changes_hands_without_a_bump() {

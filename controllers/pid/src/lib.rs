@@ -1,6 +1,6 @@
 //! The component `pid`: glue between the SDK, the shared ISA block and this controller's rule of time (`law.rs`).
 //!
-//! README.md has the ports, parameters and equations. Never: arithmetic.
+//! docs/laws.md has the ports, parameters and formulae. Never: arithmetic.
 
 pub mod law;
 

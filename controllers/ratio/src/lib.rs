@@ -165,7 +165,10 @@ mod tests {
         let end = (0..300).fold(0.0, |_, _| at(&mut bench, 20.0, 1.5));
         assert!((end - 30.0).abs() < 1e-9);
         assert_eq!(bench.written(ACTUAL), Some(1.5));
-        assert!((at(&mut bench, 40.0, 1.5) - 60.0).abs() < 1e-9, "at once, without a filter");
+        assert!(
+            (at(&mut bench, 40.0, 1.5) - 60.0).abs() < 1e-9,
+            "at once, without a filter"
+        );
         bench.set_mode(Mode::Manual);
         bench.hold(STATION.out, 10.0);
         assert_eq!(at(&mut bench, 40.0, 1.5), 10.0);

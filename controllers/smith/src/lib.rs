@@ -54,7 +54,9 @@ fn model(p: &Parameters<'_>) -> Model {
 
 fn check(p: &Parameters<'_>) -> Result<(), Fault> {
     if p.of(MODEL_GAIN) == 0.0 {
-        return Err(Fault::bad_parameter("model-gain must not be 0: nothing could be predicted"));
+        return Err(Fault::bad_parameter(
+            "model-gain must not be 0: nothing could be predicted",
+        ));
     }
     Ok(())
 }
@@ -195,7 +197,12 @@ mod tests {
         }
         let before = bench.wanted()[0];
         bench
-            .retune(&[("k", 2.0), ("model-gain", 3.0), ("model-lag", 4.0), ("model-delay", 9.0)])
+            .retune(&[
+                ("k", 2.0),
+                ("model-gain", 3.0),
+                ("model-lag", 4.0),
+                ("model-delay", 9.0),
+            ])
             .unwrap();
         let after = bench.step(1e-6).unwrap()[0];
         assert!((after - before).abs() < 1e-3, "{before} and {after}");

@@ -165,15 +165,31 @@ mod tests {
         ] {
             assert_eq!(HEAT_AND_COOL.both(u), both, "{u}");
         }
-        assert_eq!(HEAT_AND_COOL.back([0.0, 0.0], 48.0), 48.0, "within the gap it is the last");
+        assert_eq!(
+            HEAT_AND_COOL.back([0.0, 0.0], 48.0),
+            48.0,
+            "within the gap it is the last"
+        );
         assert_eq!(HEAT_AND_COOL.back([0.0, 0.0], 90.0), 55.0);
     }
 
     #[test]
     fn curves_that_cannot_be_are_refused() {
         for (curves, part) in [
-            (Curves { split: 4.0, ..HEAT_AND_COOL }, "no part of the range"),
-            (Curves { a: (5.0, 5.0), ..HEAT_AND_COOL }, "must differ"),
+            (
+                Curves {
+                    split: 4.0,
+                    ..HEAT_AND_COOL
+                },
+                "no part of the range",
+            ),
+            (
+                Curves {
+                    a: (5.0, 5.0),
+                    ..HEAT_AND_COOL
+                },
+                "must differ",
+            ),
         ] {
             assert!(matches!(curves.check(), Err(Fault::BadParameter(text)) if text.contains(part)));
         }

@@ -23,7 +23,14 @@ pub const PARAMETERS: &[ParameterSpec] = &joined::<_, { table::PARAMETERS.len() 
     table::PARAMETERS,
     &[
         ParameterSpec::number("split", "%", 50.0, 1.0, 99.0, "Where A ends and B begins"),
-        ParameterSpec::number("gap", "%", 0.0, -90.0, 90.0, "Where neither moves; negative: where both do"),
+        ParameterSpec::number(
+            "gap",
+            "%",
+            0.0,
+            -90.0,
+            90.0,
+            "Where neither moves; negative: where both do",
+        ),
         ParameterSpec::number("a-low", "out", 100.0, -1e9, 1e9, "A at 0 %"),
         ParameterSpec::number("a-split", "out", 0.0, -1e9, 1e9, "A at the split and above"),
         ParameterSpec::number("b-split", "out-b", 0.0, -1e9, 1e9, "B at the split and below"),
@@ -152,11 +159,21 @@ mod tests {
         };
         bench.set(PV, y);
         bench.set_setpoint(38.0);
-        assert_eq!(bench.step(0.1).unwrap(), [0.0, 30.0], "the first outputs are what is held");
+        assert_eq!(
+            bench.step(0.1).unwrap(),
+            [0.0, 30.0],
+            "the first outputs are what is held"
+        );
         let [a, b] = run(&mut bench, &mut y, 50.0, 300);
-        assert!((y - 50.0).abs() < 1e-3 && a == 0.0 && (b - 50.0).abs() < 1e-2, "{y} {a} {b}");
+        assert!(
+            (y - 50.0).abs() < 1e-3 && a == 0.0 && (b - 50.0).abs() < 1e-2,
+            "{y} {a} {b}"
+        );
         let [a, b] = run(&mut bench, &mut y, 8.0, 300);
-        assert!((y - 8.0).abs() < 1e-3 && (a - 30.0).abs() < 1e-2 && b == 0.0, "{y} {a} {b}");
+        assert!(
+            (y - 8.0).abs() < 1e-3 && (a - 30.0).abs() < 1e-2 && b == 0.0,
+            "{y} {a} {b}"
+        );
         // Out of reach for a long time, then back at once.
         run(&mut bench, &mut y, 300.0, 600);
         let [_, b] = run(&mut bench, &mut y, 60.0, 2);
