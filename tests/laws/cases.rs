@@ -188,7 +188,7 @@ fn steps(draw: &mut Draw, cycles: usize) -> Vec<f64> {
 }
 
 fn lead_lag(draw: &mut Draw, n: u32) -> Value {
-    let dt_s = draw.between(0.05, 0.5);
+    let dt_s = draw.on_grid(0.05, 0.5, 0.01);
     let given = vec![
         ("gain", draw.between(-2.0, 2.0)),
         ("bias", draw.between(-5.0, 5.0)),
@@ -213,7 +213,7 @@ fn lead_lag(draw: &mut Draw, n: u32) -> Value {
 }
 
 fn feedforward(draw: &mut Draw, n: u32) -> Value {
-    let dt_s = draw.between(0.05, 0.5);
+    let dt_s = draw.on_grid(0.05, 0.5, 0.01);
     let delay = draw.between(0.0, 12.0).round();
     let given = vec![
         // Without feedback only the way of the disturbance is left.

@@ -297,3 +297,59 @@ impl Program {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "tests")]
+
+    use proptest::prelude::*;
+
+    use super::*;
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(500))]
+
+        #[test]
+        fn every_plan_comes_to_its_end(
+            gain in prop_oneof![0.01..100.0f64, -100.0..-0.01f64],
+            (lag_s, delay_s) in (0.0..50.0f64, 0.0..20.0f64),
+            (horizon, moves) in (21usize..=HORIZON_MAX, 1usize..=MOVES_MAX),
+            move_weight in prop_oneof![1e-4..1e-2f64, 0.01..10.0f64],
+            out_rate_per_s in prop_oneof![Just(0.0), 0.1..10.0f64],
+            held in -20.0..120.0f64,
+            (pv, setpoint) in (-50.0..150.0f64, -50.0..150.0f64),
+            (pv_low, band) in (prop_oneof![Just(-1e9), -20.0..80.0f64], prop_oneof![Just(1e9), 0.1..60.0f64]),
+        ) {
+            let t = Tuning {
+                gain,
+                lag_s,
+                delay_s,
+                interval_s: 1.0,
+                horizon,
+                moves,
+                move_weight,
+                reference_s: 2.0,
+                filter_s: 0.0,
+                out_low: 0.0,
+                out_high: 100.0,
+                out_rate_per_s,
+                pv_low: gain.abs() * pv_low,
+                pv_high: gain.abs() * (pv_low.max(-1e8) + band),
+            };
+            let mut memory = Memory::new(&t, 50.0);
+            let sample = Sample {
+                pv: gain * pv,
+                setpoint: gain * setpoint,
+                held,
+                demand: Demand::Automatic,
+                dt_s: 1.0,
+            };
+            for _ in 0..3 {
+                let _held = memory.step(&t, &sample);
+            }
+            let program = memory.program(&t, &sample);
+            let steps = program.steps().unwrap();
+            prop_assert!(steps < crate::qp::STEPS_MAX, "{steps} steps: {program:?}");
+        }
+    }
+}

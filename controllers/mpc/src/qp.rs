@@ -1,7 +1,8 @@
 //! A small convex quadratic program: least `½·xᵀHx + gᵀx` with `A·x ≤ b`.
 //!
-//! A primal-dual interior point method with Mehrotra's predictor and corrector: some twenty steps whatever the constraints, no
-//! more than [`STEPS_MAX`], no clock, no randomness, no branch on anything but its own numbers. Each step solves
+//! A primal-dual interior point method with Mehrotra's predictor and corrector, and a careful step where these make no progress:
+//! some ten to twenty steps whatever the constraints, no more than [`STEPS_MAX`]; no clock, no randomness, no branch on anything
+//! but its own numbers. Each step solves
 //! `(H + Aᵀ·diag(z/s)·A)·dx = r` by Cholesky. Source: Nocedal and Wright, *Numerical Optimization*, 2nd ed., ch. 16.6.
 //! Never: sparse, large, or without H positive definite; an interior of `A·x ≤ b` must exist.
 
@@ -9,8 +10,12 @@ use bumpless_sdk::blocks::limit;
 
 /// Steps at most.
 pub const STEPS_MAX: usize = 40;
-/// Complementarity and residuals below which the solution counts, relative to the largest gradient.
-const TOLERANCE: f64 = 1e-10;
+/// Complementarity and residuals below which the solution counts, relative to the largest gradient or dual.
+const TOLERANCE: f64 = 1e-9;
+/// By which part a step must lower complementarity; the predictor alone may go in circles.
+const PROGRESS: f64 = 0.9;
+/// What the careful step keeps of it instead.
+const CENTRE: f64 = 0.3;
 /// Part of the way to the boundary that a step goes.
 const BOUNDARY: f64 = 0.995;
 
@@ -96,6 +101,43 @@ struct Direction {
     dual: Vec<f64>,
 }
 
+/// A step that stays off the boundary.
+const fn shorter(reach: f64) -> f64 {
+    if reach < 1.0 { BOUNDARY * reach } else { 1.0 }
+}
+
+impl Point {
+    /// The longest step along a direction that stays positive, at most 1.
+    fn reach(&self, d: &Direction) -> f64 {
+        longest(&self.slack, &d.slack).min(longest(&self.dual, &d.dual))
+    }
+
+    /// The sum of the products of slack and dual after a step.
+    fn complementarity(&self, d: &Direction, step: f64) -> f64 {
+        let slack = self.slack.iter().zip(&d.slack);
+        let dual = self.dual.iter().zip(&d.dual);
+        slack
+            .zip(dual)
+            .map(|((s, ds), (z, dz))| (s + step * ds) * (z + step * dz))
+            .sum()
+    }
+
+    fn go(&mut self, d: &Direction, step: f64) {
+        let along = |at: &mut [f64], d: &[f64]| {
+            for (at, d) in at.iter_mut().zip(d) {
+                *at += step * d;
+            }
+        };
+        along(&mut self.x, &d.x);
+        along(&mut self.slack, &d.slack);
+        along(&mut self.dual, &d.dual);
+        // Positive by the length of the step; rounding must not make it otherwise.
+        for value in self.slack.iter_mut().chain(&mut self.dual) {
+            *value = value.max(1e-300);
+        }
+    }
+}
+
 impl Program {
     fn rows(&self) -> impl Iterator<Item = &[f64]> {
         self.a.chunks_exact(self.size.max(1))
@@ -156,53 +198,70 @@ impl Program {
     /// The solution, or the best point after [`STEPS_MAX`]; none where H is not positive definite or a number is none.
     #[must_use]
     pub fn solve(&self) -> Option<Vec<f64>> {
+        self.run().map(|(x, _)| x)
+    }
+
+    /// How many steps the solution takes; [`STEPS_MAX`] where it is not reached.
+    #[cfg(test)]
+    pub(crate) fn steps(&self) -> Option<usize> {
+        self.run().map(|(_, steps)| steps)
+    }
+
+    /// A first point whose slacks and duals have the size that they need: from one step without a care for signs.
+    fn begin(&self) -> Option<Point> {
         let mut p = Point {
             x: vec![0.0; self.size],
             slack: self.b.iter().map(|b| b.max(1.0)).collect(),
             dual: vec![1.0; self.b.len()],
         };
+        let gradient = self.gradient(&p);
+        let rows = self.rows().zip(&p.slack).zip(&self.b);
+        let gap: Vec<f64> = rows.map(|((row, s), b)| dot(row, &p.x) + s - b).collect();
+        let products: Vec<f64> = p.slack.iter().zip(&p.dual).map(|(s, z)| s * z).collect();
+        let d = self.direction(&self.normal(&p)?, &p, &gradient, &gap, &products);
+        for (value, d) in (p.slack.iter_mut().zip(&d.slack)).chain(p.dual.iter_mut().zip(&d.dual)) {
+            *value = (*value + d).abs().max(1.0);
+        }
+        Some(p)
+    }
+
+    /// The solution and how many steps it took.
+    fn run(&self) -> Option<(Vec<f64>, usize)> {
+        let mut p = self.begin()?;
+        let mut steps = 0;
         let count = self.b.len().max(1) as f64;
-        let scale = self.g.iter().fold(1.0, |scale: f64, g| scale.max(g.abs()));
-        for _ in 0..STEPS_MAX {
+        let largest = |v: &[f64]| v.iter().fold(0.0_f64, |w, v| w.max(v.abs()));
+        while steps < STEPS_MAX {
             let gradient = self.gradient(&p);
             let rows = self.rows().zip(&p.slack).zip(&self.b);
             let gap: Vec<f64> = rows.map(|((row, s), b)| dot(row, &p.x) + s - b).collect();
             let mean = dot(&p.slack, &p.dual) / count;
-            let worst = |v: &[f64]| v.iter().fold(0.0_f64, |w, v| w.max(v.abs()));
-            if worst(&gradient) <= TOLERANCE * scale && worst(&gap) <= TOLERANCE * scale && mean <= TOLERANCE * scale {
+            let small = TOLERANCE * largest(&self.g).max(largest(&p.dual)).max(1.0);
+            if largest(&gradient) <= small && largest(&gap) <= small && mean <= small {
                 break;
             }
-            let l = self.normal(&p)?;
+            steps += 1;
+            // Not positive definite any more: this is as near as numbers come.
+            let Some(l) = self.normal(&p) else { break };
             let products: Vec<f64> = p.slack.iter().zip(&p.dual).map(|(s, z)| s * z).collect();
             let affine = self.direction(&l, &p, &gradient, &gap, &products);
-            let reach = longest(&p.slack, &affine.slack).min(longest(&p.dual, &affine.dual));
-            let ahead: f64 = (p.slack.iter().zip(&affine.slack))
-                .zip(p.dual.iter().zip(&affine.dual))
-                .map(|((s, ds), (z, dz))| (s + reach * ds) * (z + reach * dz))
-                .sum();
-            let centre = limit((ahead / count / mean).powi(3), 0.0, 1.0) * mean;
-            let off: Vec<f64> = products
+            let ahead = p.complementarity(&affine, p.reach(&affine)) / count;
+            let centre = limit((ahead / mean).powi(3), 0.0, 1.0) * mean;
+            let corrected: Vec<f64> = products
                 .iter()
                 .zip(affine.slack.iter().zip(&affine.dual))
                 .map(|(product, (ds, dz))| product + ds * dz - centre)
                 .collect();
-            let d = self.direction(&l, &p, &gradient, &gap, &off);
-            let reach = longest(&p.slack, &d.slack).min(longest(&p.dual, &d.dual));
-            let step = if reach < 1.0 { BOUNDARY * reach } else { 1.0 };
-            let go = |at: &mut [f64], along: &[f64]| {
-                for (at, d) in at.iter_mut().zip(along) {
-                    *at += step * d;
-                }
-            };
-            go(&mut p.x, &d.x);
-            go(&mut p.slack, &d.slack);
-            go(&mut p.dual, &d.dual);
-            // Positive by the length of the step; rounding must not make it otherwise.
-            for value in p.slack.iter_mut().chain(&mut p.dual) {
-                *value = value.max(1e-300);
+            let mut d = self.direction(&l, &p, &gradient, &gap, &corrected);
+            let mut step = shorter(p.reach(&d));
+            if p.complementarity(&d, step) > PROGRESS * mean * count {
+                let careful: Vec<f64> = products.iter().map(|product| product - CENTRE * mean).collect();
+                d = self.direction(&l, &p, &gradient, &gap, &careful);
+                step = shorter(p.reach(&d));
             }
+            p.go(&d, step);
         }
-        p.x.iter().all(|x| x.is_finite()).then_some(p.x)
+        p.x.iter().all(|x| x.is_finite()).then_some((p.x, steps))
     }
 }
 
