@@ -96,6 +96,17 @@ pub struct Memory {
     since_s: f64,
 }
 
+impl Tuning {
+    /// Greatest move; endless without a limit of the rate.
+    fn reach(&self) -> f64 {
+        if self.out_rate_per_s > 0.0 {
+            self.out_rate_per_s * self.interval_s
+        } else {
+            f64::INFINITY
+        }
+    }
+}
+
 /// The model's answer to a step of the output after `after_s`, per K.
 fn step_response(t: &Tuning, after_s: f64) -> f64 {
     if after_s > t.delay_s {
@@ -188,6 +199,7 @@ impl Memory {
             g: vec![0.0; size],
             a: Vec::new(),
             b: Vec::new(),
+            start: vec![0.0; size],
         };
         for (n, y) in free.iter().enumerate() {
             let i = n + 1;
@@ -216,11 +228,17 @@ impl Memory {
         if soft {
             p.bound_measurement(t, &free, &response);
         }
+        p.place(t, sample.held);
         p
     }
 
-    /// The first move.
+    /// The first move. An actuator beyond its limits is brought to them first, as fast as it may.
     fn plan(&self, t: &Tuning, sample: &Sample) -> Option<f64> {
+        let inside = limit(sample.held, t.out_low, t.out_high);
+        if inside != sample.held {
+            let reach = t.reach();
+            return Some(limit(inside - sample.held, -reach, reach));
+        }
         self.program(t, sample).solve()?.first().copied()
     }
 
@@ -253,26 +271,35 @@ impl Program {
         self.b.push(bound);
     }
 
-    /// Rates of the moves, and levels of their sums. A held value beyond a limit is brought to it, as fast as the rate allows.
+    /// Rates of the moves, and levels of their sums. `held` is within its limits.
     fn bound_moves(&mut self, t: &Tuning, held: f64) {
         let moves = t.moves;
         let at = |column: usize, sign: f64| (0..moves).map(move |j| if j == column { sign } else { 0.0 });
         let upto = |column: usize, sign: f64| (0..moves).map(move |j| if j <= column { sign } else { 0.0 });
-        let reach = t.out_rate_per_s * t.interval_s;
         for j in 0..moves {
-            if reach > 0.0 {
-                self.row(at(j, 1.0), reach);
-                self.row(at(j, -1.0), reach);
+            if t.reach().is_finite() {
+                self.row(at(j, 1.0), t.reach());
+                self.row(at(j, -1.0), t.reach());
             }
-            let slower = |room: f64| {
-                if reach > 0.0 {
-                    room.max(-0.99 * reach * (j + 1) as f64)
-                } else {
-                    room
-                }
-            };
-            self.row(upto(j, 1.0), slower(t.out_high - held));
-            self.row(upto(j, -1.0), slower(held - t.out_low));
+            self.row(upto(j, 1.0), t.out_high - held);
+            self.row(upto(j, -1.0), held - t.out_low);
+        }
+    }
+
+    /// Where the solver begins: one small move away from a limit that is near, and a breach that is great enough.
+    fn place(&mut self, t: &Tuning, held: f64) {
+        let margin = (0.05 * (t.out_high - t.out_low)).min(0.5 * t.reach());
+        let inside = limit(held, t.out_low + margin, t.out_high - margin);
+        if let Some(first) = self.start.first_mut() {
+            *first = inside - held;
+        }
+        if self.size > t.moves {
+            let rows = self.a.chunks_exact(self.size).zip(&self.b);
+            let beyond = rows.map(|(row, b)| row.iter().zip(&self.start).map(|(a, x)| a * x).sum::<f64>() - b);
+            let breach = beyond.fold(0.0, f64::max) + 1.0;
+            if let Some(last) = self.start.last_mut() {
+                *last = breach;
+            }
         }
     }
 
@@ -300,7 +327,7 @@ impl Program {
 
 #[cfg(test)]
 mod tests {
-    #![allow(clippy::unwrap_used, reason = "tests")]
+    #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "tests")]
 
     use proptest::prelude::*;
 
@@ -316,7 +343,7 @@ mod tests {
             (horizon, moves) in (21usize..=HORIZON_MAX, 1usize..=MOVES_MAX),
             move_weight in prop_oneof![1e-4..1e-2f64, 0.01..10.0f64],
             out_rate_per_s in prop_oneof![Just(0.0), 0.1..10.0f64],
-            held in -20.0..120.0f64,
+            held in 0.0..=100.0f64,
             (pv, setpoint) in (-50.0..150.0f64, -50.0..150.0f64),
             (pv_low, band) in (prop_oneof![Just(-1e9), -20.0..80.0f64], prop_oneof![Just(1e9), 0.1..60.0f64]),
         ) {
@@ -349,7 +376,12 @@ mod tests {
             }
             let program = memory.program(&t, &sample);
             let steps = program.steps().unwrap();
+            let x = program.solve().unwrap();
             prop_assert!(steps < crate::qp::STEPS_MAX, "{steps} steps: {program:?}");
+            let sums = (0..moves).map(|j| x[..=j].iter().sum::<f64>());
+            for sum in sums {
+                prop_assert!((-1e-6..=100.0 + 1e-6).contains(&(held + sum)), "{held} + {sum}");
+            }
         }
     }
 }

@@ -9,13 +9,15 @@
 use bumpless_sdk::blocks::limit;
 
 /// Steps at most.
-pub const STEPS_MAX: usize = 40;
+pub const STEPS_MAX: usize = 60;
 /// Complementarity and residuals below which the solution counts, relative to the largest gradient or dual.
 const TOLERANCE: f64 = 1e-9;
 /// By which part a step must lower complementarity; the predictor alone may go in circles.
 const PROGRESS: f64 = 0.9;
 /// What the careful step keeps of it instead.
 const CENTRE: f64 = 0.3;
+/// Room to a constraint that a first point is taken to have at least.
+const ROOM_MIN: f64 = 1e-6;
 /// Part of the way to the boundary that a step goes.
 const BOUNDARY: f64 = 0.995;
 
@@ -32,6 +34,8 @@ pub struct Program {
     pub a: Vec<f64>,
     /// One per row.
     pub b: Vec<f64>,
+    /// Where to begin, of length `size`: within all constraints, and not near to any of them. Every later point is within them.
+    pub start: Vec<f64>,
 }
 
 /// Lower triangle of the Cholesky factor; none where the matrix is not positive definite.
@@ -207,27 +211,19 @@ impl Program {
         self.run().map(|(_, steps)| steps)
     }
 
-    /// A first point whose slacks and duals have the size that they need: from one step without a care for signs.
-    fn begin(&self) -> Option<Point> {
-        let mut p = Point {
-            x: vec![0.0; self.size],
-            slack: self.b.iter().map(|b| b.max(1.0)).collect(),
-            dual: vec![1.0; self.b.len()],
-        };
-        let gradient = self.gradient(&p);
-        let rows = self.rows().zip(&p.slack).zip(&self.b);
-        let gap: Vec<f64> = rows.map(|((row, s), b)| dot(row, &p.x) + s - b).collect();
-        let products: Vec<f64> = p.slack.iter().zip(&p.dual).map(|(s, z)| s * z).collect();
-        let d = self.direction(&self.normal(&p)?, &p, &gradient, &gap, &products);
-        for (value, d) in (p.slack.iter_mut().zip(&d.slack)).chain(p.dual.iter_mut().zip(&d.dual)) {
-            *value = (*value + d).abs().max(1.0);
-        }
-        Some(p)
+    /// The first point: where the caller says, with duals of the size that the gradient needs.
+    fn begin(&self) -> Point {
+        let x = self.start.clone();
+        let pull = self.g.iter().fold(1.0_f64, |pull, g| pull.max(g.abs()));
+        let room = self.rows().zip(&self.b).map(|(row, b)| b - dot(row, &x));
+        let slack: Vec<f64> = room.map(|room| room.max(ROOM_MIN)).collect();
+        let dual = slack.iter().map(|slack| pull / slack).collect();
+        Point { x, slack, dual }
     }
 
     /// The solution and how many steps it took.
     fn run(&self) -> Option<(Vec<f64>, usize)> {
-        let mut p = self.begin()?;
+        let mut p = self.begin();
         let mut steps = 0;
         let count = self.b.len().max(1) as f64;
         let largest = |v: &[f64]| v.iter().fold(0.0_f64, |w, v| w.max(v.abs()));
@@ -241,8 +237,13 @@ impl Program {
                 break;
             }
             steps += 1;
-            // Not positive definite any more: this is as near as numbers come.
-            let Some(l) = self.normal(&p) else { break };
+            let Some(l) = self.normal(&p) else {
+                if steps == 1 {
+                    return None;
+                }
+                // Not positive definite any more: this is as near as numbers come.
+                break;
+            };
             let products: Vec<f64> = p.slack.iter().zip(&p.dual).map(|(s, z)| s * z).collect();
             let affine = self.direction(&l, &p, &gradient, &gap, &products);
             let ahead = p.complementarity(&affine, p.reach(&affine)) / count;
@@ -282,6 +283,7 @@ mod tests {
             g: vec![-2.0, -5.0],
             a: vec![-1.0, 2.0, 1.0, 2.0, 1.0, -2.0, -1.0, 0.0, 0.0, -1.0],
             b: vec![2.0, 6.0, 2.0, 0.0, 0.0],
+            start: vec![1.0, 1.0],
         };
         let x = program.solve().unwrap();
         assert!((x[0] - 1.4).abs() < 1e-8 && (x[1] - 1.7).abs() < 1e-8, "{x:?}");
@@ -295,6 +297,7 @@ mod tests {
             g: vec![-1.0, -2.0],
             a: vec![],
             b: vec![],
+            start: vec![0.0, 0.0],
         };
         let x = free.solve().unwrap();
         assert!(
@@ -323,7 +326,7 @@ mod tests {
                 a[2 * i * 3 + i] = 1.0;
                 a[(2 * i + 1) * 3 + i] = -1.0;
             }
-            let program = Program { size: 3, h: h.clone(), g: g.clone(), a, b: bounds.clone() };
+            let program = Program { size: 3, h: h.clone(), g: g.clone(), a, b: bounds.clone(), start: vec![0.0; 3] };
             let x = program.solve().unwrap();
             let cost = |x: &[f64]| dot(&g, x) + 0.5 * h.chunks(3).zip(x).map(|(row, x_i)| dot(row, x) * x_i).sum::<f64>();
             for i in 0..3 {
