@@ -26,6 +26,7 @@
     reason = "a test fails loudly"
 )]
 
+mod alarms;
 mod calls;
 mod changes;
 mod guides;

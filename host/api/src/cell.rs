@@ -11,6 +11,7 @@ use bumpless_deploy::{
 };
 use bumpless_deploy::{
     Window,
+    alarms::{AlarmAct, AlarmEvent, AlarmList, AlarmView},
     report::{CyclesView, ReplayReport, ShadowView, Trial, TrialReport},
     rollout::{RolloutDraft, RolloutList, RolloutView},
 };
@@ -51,6 +52,9 @@ pub(crate) trait Cell: Send + Sync + 'static {
     fn rollouts(&self) -> Answer<RolloutList>;
     fn rollout(&self, id: String) -> Answer<RolloutView>;
     fn stop_rollout(&self, id: String) -> Answer<RolloutView>;
+    fn alarms(&self) -> Answer<AlarmList>;
+    fn alarm_past(&self, max: u32) -> Answer<Vec<AlarmEvent>>;
+    fn act_on_alarm(&self, id: LoopId, alarm: String, act: AlarmAct, by: String) -> Answer<Option<AlarmView>>;
     fn hosts(&self) -> Vec<HostView>;
     fn here(&self) -> HostId;
     fn points(&self) -> Answer<Vec<PointView>>;
@@ -204,6 +208,21 @@ impl Cell for Deploy {
     fn stop_rollout(&self, id: String) -> Answer<RolloutView> {
         let deploy = self.clone();
         Box::pin(async move { deploy.stop_rollout(&id).await })
+    }
+
+    fn alarms(&self) -> Answer<AlarmList> {
+        let deploy = self.clone();
+        Box::pin(async move { Ok(deploy.alarms().await) })
+    }
+
+    fn alarm_past(&self, max: u32) -> Answer<Vec<AlarmEvent>> {
+        let deploy = self.clone();
+        Box::pin(async move { deploy.alarm_past(max).await })
+    }
+
+    fn act_on_alarm(&self, id: LoopId, alarm: String, act: AlarmAct, by: String) -> Answer<Option<AlarmView>> {
+        let deploy = self.clone();
+        Box::pin(async move { deploy.act_on_alarm(&id, &alarm, act, &by).await })
     }
 
     fn hosts(&self) -> Vec<HostView> {

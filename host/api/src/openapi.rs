@@ -4,7 +4,7 @@ use utoipa::OpenApi;
 
 use crate::{
     error::Problem,
-    routes::{bundle, components, history, hosts, live, loops, pages, rollouts},
+    routes::{alarms, bundle, components, history, hosts, live, loops, pages, rollouts},
     types,
 };
 
@@ -23,6 +23,7 @@ use crate::{
         history::cycles, history::replay, history::backtest,
         history::start_shadow, history::shadows, history::show_shadow, history::stop_shadow,
         rollouts::start, rollouts::list, rollouts::show, rollouts::stop,
+        alarms::list, alarms::past, alarms::act, alarms::define, alarms::remove,
         hosts::list, hosts::points, live::feed,
         pages::healthz, pages::readyz, pages::metrics, pages::openapi,
     ),
@@ -33,6 +34,7 @@ use crate::{
         (name = "commands", description = "What an operator asks of a running loop; answered when a committed record holds it"),
         (name = "history", description = "Looking back: recorded cycles, replays, and candidates tried on them or beside a running loop"),
         (name = "rollouts", description = "One component for many loops: one loop first, then the rest by rule"),
+        (name = "alarms", description = "What stands, what happened, and what people do about it, by ANSI/ISA-18.2"),
         (name = "cell", description = "Hosts, points and the live feed"),
         (name = "operation", description = "For supervisors and monitoring"),
     )

@@ -2,6 +2,7 @@
 //!
 //! Never: decides; what may be done is the cell's to say.
 
+pub(crate) mod alarms;
 pub(crate) mod bundle;
 pub(crate) mod components;
 pub(crate) mod history;
@@ -57,6 +58,12 @@ pub(crate) fn all() -> Router<App> {
         .route("/v1/rollouts", get(rollouts::list).post(rollouts::start))
         .route("/v1/rollouts/{id}", get(rollouts::show))
         .route("/v1/rollouts/{id}/stop", post(rollouts::stop))
+        .route("/v1/alarms", get(alarms::list))
+        .route("/v1/alarms/history", get(alarms::past))
+        .route(
+            "/v1/loops/{name}/alarms/{alarm}",
+            post(alarms::act).put(alarms::define).delete(alarms::remove),
+        )
         .route("/v1/hosts", get(hosts::list))
         .route("/v1/points", get(hosts::points))
         .route("/v1/live", get(live::feed))

@@ -3,6 +3,8 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "tests")]
 
+mod alarms;
+mod candidates;
 mod fake;
 mod history;
 mod library;

@@ -5,6 +5,7 @@
 //! message bytes are base64, a number that is not finite is null.
 //! Never: decides or checks more than its own shape; the cell does.
 
+mod alarms;
 mod call;
 mod component;
 mod history;
@@ -15,6 +16,10 @@ mod record;
 mod rollouts;
 mod words;
 
+pub use alarms::{
+    AlarmActRequest, AlarmActWord, AlarmDefinition, AlarmFlood, AlarmHappening, AlarmHistory, AlarmKind, AlarmShelf,
+    AlarmState, LoopAlarm, LoopAlarms,
+};
 pub use call::{CallAnswer, CallRequest};
 pub use component::{Component, Components, Parameter, Port};
 pub use history::{

@@ -7,10 +7,12 @@ use std::path::PathBuf;
 use clap::{CommandFactory as _, Parser, Subcommand, ValueEnum};
 use clap_complete::Shell;
 
+mod alarm;
 mod history;
 mod library;
 mod rollout;
 
+pub(crate) use alarm::{AlarmCommand, Of as AlarmOf};
 pub(crate) use history::HistoryCommand;
 pub(crate) use library::{ComponentsArgs, ComponentsCommand, FilterArgs, UploadArgs};
 pub(crate) use rollout::{RolloutArgs, RolloutCommand};
@@ -64,6 +66,11 @@ pub(crate) enum Command {
     Rollout {
         #[command(subcommand)]
         what: RolloutCommand,
+    },
+    /// Alarms: what stands, what happened, acknowledge, shelve, define.
+    Alarm {
+        #[command(subcommand)]
+        what: Option<AlarmCommand>,
     },
     /// Run one step of a component somewhere in the cell.
     Call(CallArgs),
@@ -311,6 +318,7 @@ pub fn run(cli: Cli) -> Result<(), Error> {
         }
         Command::Loop { what } => commands::loops::run(&client()?, json, what),
         Command::Rollout { what } => commands::rollouts::run(&client()?, json, what),
+        Command::Alarm { what } => commands::alarms::run(&client()?, json, what.unwrap_or(AlarmCommand::standing())),
         Command::Call(args) => commands::components::call(&client()?, json, args),
         Command::Hosts => commands::hosts::list(&client()?, json),
         Command::Points => commands::hosts::points(&client()?, json),
@@ -369,6 +377,14 @@ mod tests {
             "bumpless rollout list",
             "bumpless rollout show plant.3",
             "bumpless rollout stop plant.3",
+            "bumpless alarm",
+            "bumpless alarm list --all --loop pressure",
+            "bumpless alarm history --limit 20",
+            "bumpless alarm ack pressure high --note seen --by ann",
+            "bumpless alarm shelve pressure high --for 30m --reason cleaning",
+            "bumpless alarm out pressure high --reason repair",
+            "bumpless alarm define alarms.toml",
+            "bumpless alarm remove pressure high",
             "bumpless loop backtest pressure pidplus -p k=2 -p action=direct --last 5000 --plot x.svg",
             "bumpless loop shadow pressure pidplus --cycles 200 --wait",
             "bumpless loop shadows pressure 3 --stop",
@@ -397,6 +413,11 @@ mod tests {
                 "bumpless rollout start pid l --on-failure forth",
                 "[possible values: stop, back]",
             ),
+            ("bumpless alarm shelve pressure high --for 30m", "--reason"),
+            (
+                "bumpless alarm shelve pressure high --for soon --reason x",
+                "write it as 30s, 10m or 2h",
+            ),
             ("bumpless lop", "'loop'"),
         ] {
             let error = parse(bad).expect_err(bad);
@@ -421,6 +442,7 @@ mod tests {
             "components ",
             "loop ",
             "rollout ",
+            "alarm ",
             "call ",
             "hosts ",
             "watch ",

@@ -7,6 +7,7 @@
 //!
 //! Reading order: the nouns (`name` to `record`), the messages (`protocol`), then the decisions along one cycle
 //! (`tick`, `desk` with `arbiter`, `seat` with `select`, `vote` and `swap`, `guard`), then `place` and `indices`.
+//! (`tick`, `desk` with `arbiter`, `seat` with `select` and `swap`, `guard`), then `place`, `indices` and `alarms`.
 
 pub mod limits;
 
@@ -24,6 +25,7 @@ pub mod redundancy;
 pub mod spec;
 pub mod wiring;
 
+pub mod alarms;
 pub mod arbiter;
 pub mod desk;
 pub mod guard;

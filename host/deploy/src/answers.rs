@@ -73,6 +73,7 @@ impl Room {
                     report.map(Box::new).map(Told::Tried)
                 }
                 Ask::Shadow(id, ask) => self.shadow_here(&from, id, ask).await,
+                Ask::Alarm(ask) => self.alarms_here(ask).await,
                 Ask::Rollout(ask) => self.rollout_here(ask).await,
                 Ask::Records(ids) => {
                     let last = ids.iter().take(RECORDS_ASKED).filter_map(|id| self.feed.last(id));

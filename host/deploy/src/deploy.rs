@@ -28,6 +28,7 @@ use crate::{
     wire::{Amend, Ask, Told},
 };
 
+mod alarms;
 mod past;
 mod rollouts;
 

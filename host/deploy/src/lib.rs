@@ -21,6 +21,7 @@
 //! `sync`, `answers`, `service`, `room`, `deploy` (how it hangs together).
 
 mod admission;
+pub mod alarms;
 mod answers;
 mod aside;
 mod bench;

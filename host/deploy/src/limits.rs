@@ -203,3 +203,9 @@ pub const CALL_LIMIT_NS: u64 = 10_000_000;
 
 /// How long a call from outside may take in all.
 pub const CALL_WAIT: Duration = Duration::from_secs(5);
+
+/// Changes of alarms that a live listener may lag behind; it then loses the oldest, and the list says how things stand.
+pub const ALARM_EVENTS: usize = 1_024;
+
+/// Past changes of alarms in one answer: a few MB.
+pub const ALARM_PAST_MAX: u32 = 10_000;

@@ -31,6 +31,7 @@ use tokio::{
 };
 
 use crate::{
+    alarms::Alarms,
     bench::Bench,
     book::Book,
     error::{Error, Words, chain},
@@ -145,6 +146,7 @@ pub(crate) struct Room {
     pub(crate) cycles: Option<Arc<CycleLog>>,
     pub(crate) shadows: Shadows,
     pub(crate) rollouts: Ledger,
+    pub(crate) alarms: Alarms,
     /// Replays and backtests.
     pub(crate) rehearsals: Semaphore,
     pub(crate) holder: Holder,
@@ -218,6 +220,7 @@ impl Room {
             cycles,
             shadows: Shadows::default(),
             rollouts: Ledger::default(),
+            alarms: Alarms::default(),
             rehearsals: Semaphore::new(REHEARSALS_MAX),
             holder: Holder::default(),
             homes: Homes::default(),
@@ -255,6 +258,8 @@ impl Room {
         room.spawn(Self::reconcile_holds(Arc::clone(&room)));
         room.spawn(Self::prepare_ahead(Arc::clone(&room)));
         room.spawn(Self::hear_notices(Arc::clone(&room), arrived));
+        room.read_alarms()?;
+        room.spawn(Self::watch_alarms(Arc::clone(&room), room.feed.subscribe()));
         room.resume_rollouts()?;
         Ok(room)
     }

@@ -6,11 +6,14 @@
 
 use std::collections::BTreeMap;
 
-use bumpless_core::{Command, ComponentInfo, Digest, Edition, HostId, Intent, LoopId, LoopSpec, PointId, Record};
+use bumpless_core::{
+    Command, ComponentInfo, Digest, Edition, HostId, Intent, LoopId, LoopSpec, PointId, Record, alarms::Flood,
+};
 use bumpless_store::{Tombstone, Window};
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
 use crate::{
+    alarms::{AlarmAct, AlarmEvent, AlarmView},
     draft::{Change, LoopDraft},
     error::{Error, Words},
     report::{CyclesView, ReplayReport, ShadowView, Trial, TrialReport},
@@ -79,6 +82,28 @@ pub(crate) enum Ask {
     Shadow(LoopId, ShadowAsk),
     /// About the rollouts of the host.
     Rollout(RolloutAsk),
+    /// About the alarms of loops at home there.
+    Alarm(AlarmAsk),
+}
+
+/// What may be asked about alarms.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) enum AlarmAsk {
+    /// All of them.
+    List,
+    /// What happened, newest first, at most so much.
+    Past(u32),
+    /// A person does something.
+    Act {
+        /// The loop.
+        loop_id: LoopId,
+        /// The alarm.
+        alarm: String,
+        /// What is done.
+        act: AlarmAct,
+        /// Who.
+        by: String,
+    },
 }
 
 /// What may be asked about rollouts.
@@ -175,6 +200,10 @@ pub(crate) enum Told {
     Shadows(Vec<ShadowView>),
     /// Rollouts.
     Rollouts(Vec<RolloutView>),
+    /// Alarms, and how many of them came lately.
+    Alarms(Vec<AlarmView>, Flood),
+    /// What happened to alarms.
+    AlarmPast(Vec<AlarmEvent>),
     /// A component's bytes. Never written by serde: see [`encode_reply`].
     #[serde(skip)]
     Bytes(Vec<u8>),

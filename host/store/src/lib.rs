@@ -7,7 +7,7 @@
 //! ```text
 //! <dir>/                     0700
 //!   lock                     held while a process has the store open; names that process
-//!   host.redb                infos, intents, tombstones, last records, rollouts, settings
+//!   host.redb                infos, intents, tombstones, last records, rollouts, alarms, settings
 //!   cycles.redb              every record of the loops at home here, up to a bound
 //!   components/<digest>.wasm the bytes, named by what they are
 //!   secrets/<name>           0600, 32 random bytes
@@ -15,13 +15,14 @@
 //!
 //! | what | durable when the call returns? | why |
 //! |---|---|---|
-//! | component, info, intent, tombstone, rollout, setting, secret | yes, fsync | people were told that it is done |
+//! | component, info, intent, tombstone, rollout, alarm, setting, secret | yes, fsync | people were told that it is done |
 //! | recorded cycle | no: within a second | it is for looking back; nothing that runs depends on it |
 //! | last record | no: within a second | the standbys hold newer ones; a sync per cycle would wear out the disk |
 //!
 //! All calls block on the disk. Async callers use a blocking thread. A wait for another writer is as long as that one's
 //! fsync: the operating system's bound, not ours.
 
+mod alarms;
 mod components;
 mod cycles;
 mod database;
@@ -34,6 +35,7 @@ mod settings;
 mod store;
 mod writer;
 
+pub use alarms::ALARM_CHANGES_MAX;
 pub use cycles::{BYTES_MAX as CYCLE_BYTES_MAX, Cursor, CycleCounts, CycleLog, Window};
 pub use error::Error;
 pub use intents::Tombstone;

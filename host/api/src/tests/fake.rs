@@ -15,16 +15,18 @@ use bumpless_deploy::{
 };
 use bumpless_deploy::{
     Window,
-    report::{
-        CurvePoint, CyclesView, Finding, IndexReport, OutputReport, ReplayReport, ShadowView, Skipped, StepTimes,
-        Trial, TrialReport, Verdict,
-    },
+    alarms::{AlarmAct, AlarmEvent, AlarmList, AlarmView},
+    report::{CyclesView, Finding, ReplayReport, ShadowView, Skipped, Trial, TrialReport},
     rollout::{RolloutDraft, RolloutList, RolloutView, State},
 };
 use serde_json::{Value, json};
 use tokio::sync::{Notify, broadcast};
 
-use super::rollouts::rollout;
+use super::{
+    alarms::alarms,
+    candidates::{shadow, trial, trial_report},
+    rollouts::rollout,
+};
 use crate::cell::{Answer, Cell};
 
 /// Records that a lagging reader still gets.
@@ -49,6 +51,7 @@ pub(crate) struct Fake {
     pub(crate) panics: AtomicBool,
     pub(crate) windows: Mutex<Vec<Window>>,
     pub(crate) rollouts: Mutex<Vec<RolloutDraft>>,
+    pub(crate) alarm_acts: Mutex<Vec<(String, AlarmAct, String)>>,
     records: broadcast::Sender<Arc<Record>>,
 }
 
@@ -70,6 +73,7 @@ impl Fake {
             panics: AtomicBool::new(false),
             windows: Mutex::default(),
             rollouts: Mutex::default(),
+            alarm_acts: Mutex::default(),
             records: broadcast::channel(FEED_CAPACITY).0,
         }
     }
@@ -274,76 +278,6 @@ fn apply_end() -> ApplyEnd {
     }
 }
 
-fn trial() -> Trial {
-    Trial {
-        component: "pid".into(),
-        parameters: Default::default(),
-    }
-}
-
-fn shadow(id: LoopId, trial: Trial, cycles_wanted: u64) -> ShadowView {
-    ShadowView {
-        id: 1,
-        cycles_wanted,
-        missed: 0,
-        started_at_unix_ms: 7,
-        ended: None,
-        complete: false,
-        report: trial_report(id, trial),
-    }
-}
-
-fn trial_report(loop_id: LoopId, trial: Trial) -> TrialReport {
-    TrialReport {
-        loop_id,
-        component: trial.component,
-        digest: digest(),
-        parameters: trial.parameters,
-        dropped_parameters: vec!["kd".into()],
-        dropped_ports: vec![],
-        taken_over_by: Some("migrate".into()),
-        anchored_anew: 0,
-        from_ns: 1_000_000,
-        to_ns: 2_000_000,
-        cycles: 2,
-        compared: 2,
-        equal: 1,
-        held: 0,
-        faults: 0,
-        first_fault: None,
-        skipped: vec![],
-        bump_percent: Some(f64::INFINITY),
-        bump_limit_percent: 5.0,
-        outputs: vec![OutputReport {
-            port: "out".into(),
-            unit: "%".into(),
-            span: 100.0,
-            max_percent: 7.0,
-            max_at: (1, 2),
-            mean_percent: 3.5,
-            rms_percent: 5.0,
-            recorded_travel: 1.0,
-            candidate_travel: 8.0,
-        }],
-        steps: StepTimes::default(),
-        indices: IndexReport::default(),
-        verdict: Some(Verdict::Differs),
-        reason: "out is up to 7 % away".into(),
-        measured_port: Some("pv".into()),
-        measured_unit: "bar".into(),
-        cycles_per_point: 1,
-        points: vec![CurvePoint {
-            at_ns: 1_000_000,
-            setpoint: 1.0,
-            measurement: f64::NAN,
-            recorded: vec![1.0],
-            candidate: vec![8.0],
-        }],
-        unread: 0,
-        stopped_early: None,
-    }
-}
-
 impl Cell for Fake {
     fn upload(&self, bytes: Vec<u8>, upload: Upload) -> Answer<ComponentInfo> {
         self.uploads.lock().unwrap().push((bytes, upload));
@@ -533,6 +467,24 @@ impl Cell for Fake {
 
     fn stop_rollout(&self, id: String) -> Answer<RolloutView> {
         self.answer(rollout(id, State::Stopped))
+    }
+
+    fn alarms(&self) -> Answer<AlarmList> {
+        self.answer(AlarmList {
+            alarms: alarms(),
+            floods: Default::default(),
+            silent: Vec::new(),
+        })
+    }
+
+    fn alarm_past(&self, _max: u32) -> Answer<Vec<AlarmEvent>> {
+        self.answer(Vec::new())
+    }
+
+    fn act_on_alarm(&self, _id: LoopId, alarm: String, act: AlarmAct, by: String) -> Answer<Option<AlarmView>> {
+        let view = alarms().into_iter().find(|view| view.standing.definition.name == alarm);
+        self.alarm_acts.lock().unwrap().push((alarm, act, by));
+        self.answer(view)
     }
 
     fn hosts(&self) -> Vec<HostView> {
