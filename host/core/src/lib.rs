@@ -6,8 +6,7 @@
 //! same code runs in a host, in a test and under a model checker.
 //!
 //! Reading order: the nouns (`name` to `record`), the messages (`protocol`), then the decisions along one cycle
-//! (`tick`, `desk` with `arbiter`, `seat` with `select`, `vote` and `swap`, `guard`), then `place` and `indices`.
-//! (`tick`, `desk` with `arbiter`, `seat` with `select` and `swap`, `guard`), then `place`, `indices` and `alarms`.
+//! (`tick`, `desk` with `arbiter`, `seat` with `select`, `vote` and `swap`, `guard`), then `place`, `indices` and `alarms`.
 
 pub mod limits;
 

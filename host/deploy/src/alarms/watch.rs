@@ -84,9 +84,13 @@ impl Room {
     }
 
     fn look_at(&self, record: &Record, known: &mut HashMap<LoopId, Ports>, events: &mut Vec<AlarmEvent>) {
-        let Some(intent) = self.book.get(&record.loop_id).filter(|intent| intent.home == self.here) else {
+        if self
+            .book
+            .get(&record.loop_id)
+            .is_none_or(|intent| intent.home != self.here)
+        {
             return;
-        };
+        }
         let stale = |ports: &Ports| ports.revision != record.revision;
         if known.get(&record.loop_id).is_none_or(stale) {
             let Some(info) = self.library.get(&record.digest) else {
@@ -117,8 +121,7 @@ impl Room {
             }
             ports.insert(name.clone(), seen);
         }
-        let members = self.homes.members(&record.loop_id).len();
-        let so = what_is_so(record, members < usize::from(intent.current.replicas));
+        let so = what_is_so(record);
         let mut boards = self.alarms.boards.lock();
         let board = boards.entry(record.loop_id.clone()).or_default();
         let changes = board.see(Sight {
@@ -164,7 +167,7 @@ impl Room {
 }
 
 /// Which of the kinds that belong to a whole loop a record shows.
-fn what_is_so(record: &Record, too_few: bool) -> Vec<Kind> {
+fn what_is_so(record: &Record) -> Vec<Kind> {
     let mut so = Vec::new();
     if record.faults_in_row > 0 {
         so.push(Kind::Fault);
@@ -174,8 +177,11 @@ fn what_is_so(record: &Record, too_few: bool) -> Vec<Kind> {
     if record.events.iter().any(overran) {
         so.push(Kind::Overrun);
     }
-    if too_few {
+    if record.redundancy.want > 0 && !record.redundancy.whole() {
         so.push(Kind::RedundancyLost);
+    }
+    if record.events.iter().any(|event| matches!(event, Event::Dissent { .. })) {
+        so.push(Kind::Dissent);
     }
     so
 }
