@@ -35,6 +35,9 @@ pub(crate) enum Error {
     /// The bus.
     #[error("the bus could not be joined")]
     Bus(#[source] bumpless_cell::Error),
+    /// The lab.
+    #[error("the lab")]
+    Lab(#[from] bumpless_lab::Error),
     /// The loops.
     #[error("the loops did not take it")]
     Loops(#[from] bumpless_loops::Error),

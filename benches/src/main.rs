@@ -12,6 +12,7 @@ mod error;
 mod failover;
 mod faults;
 mod history;
+mod lab;
 mod law;
 mod local;
 mod peer;
@@ -60,6 +61,8 @@ enum Bench {
     Swap(switch::Switching),
     /// From an upload to the first cycle, what running loops feel of it, bombs, and many uploads at once.
     Upload,
+    /// Virtual time: hours of the pilot plant per second and core, against the same experiment as plain functions.
+    Lab,
     /// A step native and in the sandbox, and the cycle of a loop whose owner, replica and I/O are one process.
     Step,
     /// The other process of `call`.
@@ -124,6 +127,7 @@ fn run(bench: &Bench, options: Options) -> Result<bool, Error> {
         Bench::Failover { .. } => "failover",
         Bench::Select => "select",
         Bench::Swap(_) => "swap",
+        Bench::Lab => "lab",
         Bench::Step => "step",
         Bench::Upload => "upload",
         Bench::Burn { core } => return stress::burn(*core).map(|()| true),
@@ -137,6 +141,7 @@ fn run(bench: &Bench, options: Options) -> Result<bool, Error> {
         Bench::Select => select::run(options, &mut report)?,
         Bench::Swap(switching) if switching.is_wanted() => switch::run(options, *switching, &mut report)?,
         Bench::Swap(_) => swap::run(options, &mut report)?,
+        Bench::Lab => lab::run(options, &mut report)?,
         Bench::Step => step::run(options, &mut report)?,
         Bench::Upload => upload::run(options, &mut report)?,
         Bench::CallPeer { .. } | Bench::Burn { .. } => {}

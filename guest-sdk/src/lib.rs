@@ -1,5 +1,5 @@
 //! What the author of a controller uses: tables of ports and parameters, the [`Controller`] trait, the [`export!`] macro,
-//! control [`blocks`] and, on the author's own machine, a test [`mod@bench`].
+//! control [`blocks`] and, on the author's own machine, a test [`mod@bench`]. Who writes a simulated plant uses [`plant`].
 //!
 //! Owns the form of the state bytes ([`envelope`]): the SDK keeps the component's name, the layout and the parameter values
 //! in front of the law's own state, so that a step needs nothing else and a swap finds everything it may carry over.
@@ -74,12 +74,16 @@ pub use io::{Cycle, Fault, Io, Level, Message, Mode, Priority, Quality, Reading}
 
 pub mod blocks;
 pub mod envelope;
+pub mod plant;
 
 #[doc(hidden)]
 pub mod glue;
 
 #[doc(hidden)]
 pub mod bindings;
+
+#[doc(hidden)]
+pub mod plant_bindings;
 
 #[cfg(target_arch = "wasm32")]
 mod imports;

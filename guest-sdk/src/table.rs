@@ -367,7 +367,7 @@ const fn parameter_index(parameters: &[ParameterSpec], name: &str) -> usize {
 }
 
 /// `==` of texts, for constant functions.
-const fn same(a: &str, b: &str) -> bool {
+pub(crate) const fn same(a: &str, b: &str) -> bool {
     let (a, b) = (a.as_bytes(), b.as_bytes());
     if a.len() != b.len() {
         return false;

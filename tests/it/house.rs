@@ -16,7 +16,7 @@ use serde_json::Value;
 const LINES_MAX: usize = 600;
 
 /// What each room may use of the others. Nothing imports upwards; `io engine store cell` never import each other.
-const ROOMS: [(&str, &[&str]); 29] = [
+const ROOMS: [(&str, &[&str]); 34] = [
     ("bumpless-core", &[]),
     ("bumpless-io", &["bumpless-core"]),
     ("bumpless-engine", &["bumpless-core"]),
@@ -38,6 +38,7 @@ const ROOMS: [(&str, &[&str]); 29] = [
         ],
     ),
     ("bumpless-api", &["bumpless-core", "bumpless-deploy"]),
+    ("bumpless-lab", &["bumpless-core", "bumpless-io", "bumpless-engine"]),
     (
         "bumpless-app",
         &[
@@ -49,6 +50,7 @@ const ROOMS: [(&str, &[&str]); 29] = [
             "bumpless-loops",
             "bumpless-deploy",
             "bumpless-api",
+            "bumpless-lab",
         ],
     ),
     ("bumpless-sdk", &[]),
@@ -68,6 +70,10 @@ const ROOMS: [(&str, &[&str]); 29] = [
     ("bumpless-ratio", &["bumpless-isa", "bumpless-sdk"]),
     ("bumpless-smith", &["bumpless-isa", "bumpless-sdk"]),
     ("bumpless-split-range", &["bumpless-isa", "bumpless-sdk"]),
+    ("plant-fopdt", &["bumpless-sdk"]),
+    ("plant-integrating", &["bumpless-sdk"]),
+    ("plant-quadruple-tank", &["bumpless-sdk"]),
+    ("plant-cstr", &["bumpless-sdk"]),
     ("bumpless-model", &["bumpless-core"]),
     ("bumpless-simulation", &["bumpless-core"]),
     ("xtask", &["bumpless-core"]),
@@ -102,11 +108,13 @@ const CONFINED: [(&str, &[&str]); 11] = [
 ];
 
 /// Where `unsafe` is: the loading of compiled code, one system call, and the canonical ABI of guests.
-const UNSAFE: [&str; 6] = [
+const UNSAFE: [&str; 8] = [
     "host/app/src/realtime.rs",
     "host/engine/src/cache.rs",
     "guest-sdk/src/bindings.rs",
     "guest-sdk/src/lib.rs",
+    "guest-sdk/src/plant.rs",
+    "guest-sdk/src/plant_bindings.rs",
     "tests/guests/forbidden-import/src/lib.rs",
     "tests/guests/wrong-world/src/lib.rs",
 ];

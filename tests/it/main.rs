@@ -16,6 +16,7 @@
 //! | watching | metrics, the document of the API, the live feed |
 //! | library | trials, labels, bundles, bombs and crowds of components |
 //! | stock | every stock law passes its trial |
+//! | lab | virtual time against a live cell, and the ways between the two; plants as components |
 //! | guides | the commands in the documentation |
 //! | house | the rules of the source itself |
 
@@ -32,6 +33,7 @@ mod changes;
 mod guides;
 mod history;
 mod house;
+mod lab;
 mod library;
 mod members;
 mod modbus;

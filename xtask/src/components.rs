@@ -94,6 +94,8 @@ pub struct Built {
     pub path: PathBuf,
     /// Is it a guest for tests, not a stock controller?
     pub guest: bool,
+    /// Is it a simulated plant?
+    pub plant: bool,
     /// Its size.
     pub bytes: u64,
     /// Its digest.
@@ -156,6 +158,7 @@ struct Source {
     package: String,
     name: String,
     guest: bool,
+    plant: bool,
     any_import: bool,
 }
 
@@ -179,6 +182,8 @@ pub fn run() -> Result<(), Error> {
     for c in &built {
         let name = if c.guest {
             format!("guests/{}", c.name)
+        } else if c.plant {
+            format!("plants/{}", c.name)
         } else {
             c.name.clone()
         };
@@ -192,12 +197,13 @@ pub fn build_all() -> Result<(PathBuf, Vec<Built>), Error> {
     let metadata = metadata()?;
     let sources = sources(&metadata);
     let folder = metadata.target_directory.join("components");
-    let guests = folder.join("guests");
-    fs::create_dir_all(&guests).map_err(|source| Error::File {
-        path: guests.clone(),
-        action: "written",
-        source,
-    })?;
+    for inner in ["guests", "plants"].map(|name| folder.join(name)) {
+        fs::create_dir_all(&inner).map_err(|source| Error::File {
+            path: inner.clone(),
+            action: "written",
+            source,
+        })?;
+    }
 
     // Released when the file is closed, also when this process is killed.
     let lock_path = folder.join(".lock");
@@ -253,7 +259,7 @@ fn metadata() -> Result<Metadata, Error> {
     serde_json::from_slice(&text).map_err(Error::Message)
 }
 
-/// The crates with a `cdylib` under `controllers` and `tests/guests`: controllers first, then guests, by name.
+/// The crates with a `cdylib` under `controllers`, `plants` and `tests/guests`, in this order, by name.
 fn sources(metadata: &Metadata) -> Vec<Source> {
     let mut sources: Vec<Source> = metadata
         .packages
@@ -266,17 +272,19 @@ fn sources(metadata: &Metadata) -> Vec<Source> {
             let name = folder.file_name()?.to_str()?.to_owned();
             let component = p.metadata.as_ref().and_then(|m| m.component.as_ref());
             let any_import = component.is_some_and(|c| c.imports == Imports::Any);
-            let ours = guest || place == Path::new("controllers");
+            let plant = place == Path::new("plants");
+            let ours = guest || plant || place == Path::new("controllers");
             ours.then(|| Source {
                 id: p.id.clone(),
                 package: p.name.clone(),
                 name,
                 guest,
+                plant,
                 any_import,
             })
         })
         .collect();
-    sources.sort_by(|a, b| (a.guest, &a.name).cmp(&(b.guest, &b.name)));
+    sources.sort_by(|a, b| (a.guest, a.plant, &a.name).cmp(&(b.guest, b.plant, &b.name)));
     sources
 }
 
@@ -350,6 +358,8 @@ fn componentize(source: &Source, modules: &[(String, PathBuf, bool)], folder: &P
     let file = format!("{}.wasm", source.name);
     let path = if source.guest {
         folder.join("guests").join(file)
+    } else if source.plant {
+        folder.join("plants").join(file)
     } else {
         folder.join(file)
     };
@@ -363,6 +373,7 @@ fn componentize(source: &Source, modules: &[(String, PathBuf, bool)], folder: &P
         name: source.name.clone(),
         path,
         guest: source.guest,
+        plant: source.plant,
         bytes: bytes.len() as u64,
         digest,
     })
@@ -457,7 +468,11 @@ mod tests {
     #[test]
     fn components_are_built_once_and_import_only_what_the_host_gives() {
         let (folder, first) = build_all().expect("components build");
-        let names: Vec<&str> = first.iter().filter(|c| !c.guest).map(|c| c.name.as_str()).collect();
+        let names: Vec<&str> = first
+            .iter()
+            .filter(|c| !c.guest && !c.plant)
+            .map(|c| c.name.as_str())
+            .collect();
         assert_eq!(
             names,
             [

@@ -9,11 +9,13 @@ use clap_complete::Shell;
 
 mod alarm;
 mod history;
+mod lab;
 mod library;
 mod rollout;
 
 pub(crate) use alarm::{AlarmCommand, Of as AlarmOf};
 pub(crate) use history::HistoryCommand;
+pub(crate) use lab::{LabArgs, LabCommand, LabRunArgs};
 pub(crate) use library::{ComponentsArgs, ComponentsCommand, FilterArgs, UploadArgs};
 pub(crate) use rollout::{RolloutArgs, RolloutCommand};
 
@@ -72,6 +74,8 @@ pub(crate) enum Command {
         #[command(subcommand)]
         what: Option<AlarmCommand>,
     },
+    /// Control experiments in virtual time: run, compare, sweep, report; from a recorded loop, and to a live one.
+    Lab(LabArgs),
     /// Run one step of a component somewhere in the cell.
     Call(CallArgs),
     /// List the hosts of the cell.
@@ -319,6 +323,7 @@ pub fn run(cli: Cli) -> Result<(), Error> {
         Command::Loop { what } => commands::loops::run(&client()?, json, what),
         Command::Rollout { what } => commands::rollouts::run(&client()?, json, what),
         Command::Alarm { what } => commands::alarms::run(&client()?, json, what.unwrap_or(AlarmCommand::standing())),
+        Command::Lab(LabArgs { what }) => commands::lab::run(client, json, what),
         Command::Call(args) => commands::components::call(&client()?, json, args),
         Command::Hosts => commands::hosts::list(&client()?, json),
         Command::Points => commands::hosts::points(&client()?, json),
@@ -388,6 +393,13 @@ mod tests {
             "bumpless loop backtest pressure pidplus -p k=2 -p action=direct --last 5000 --plot x.svg",
             "bumpless loop shadow pressure pidplus --cycles 200 --wait",
             "bumpless loop shadows pressure 3 --stop",
+            "bumpless lab run a.toml b.toml --out x --jobs 2 --seeds 5 --fresh",
+            "bumpless lab compare a.toml pid pidplus:k=2,ti=3",
+            "bumpless lab sweep a.toml loop.flow.period_ms=500,1000 --json",
+            "bumpless lab report a.toml",
+            "bumpless lab record pressure --last 10m -o window.json",
+            "bumpless lab fit window.json",
+            "bumpless lab promote a.toml pressure --by itae --cycles 100 --wait",
             "bumpless call pid --input pv=1 --input ff=-2 --strategy latency",
             "bumpless watch pressure --plain --cycles 5",
             "bumpless demo --for 5 --restart",

@@ -7,6 +7,7 @@ pub(crate) mod components;
 pub(crate) mod curves;
 pub(crate) mod history;
 pub(crate) mod hosts;
+pub(crate) mod lab;
 pub(crate) mod library;
 pub(crate) mod loops;
 pub(crate) mod rollouts;

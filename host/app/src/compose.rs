@@ -16,6 +16,7 @@ use bumpless_cell::{Arrival, Roles, Session};
 use bumpless_deploy::{Deploy, DeployArrival, Parts};
 use bumpless_engine::Engine;
 use bumpless_io::{Clock, IoServer};
+use bumpless_lab::Library;
 use bumpless_loops::{Loops, LoopsEvent};
 use bumpless_store::{CycleLog, RecordWriter, Store};
 use tokio::{
@@ -120,7 +121,12 @@ pub async fn run(config: Config) -> Result<Running, Error> {
         .map_err(|e| Error::start("the engine", e))?;
     let io = if config.io {
         let runtime = tokio::runtime::Handle::current();
-        let server = IoServer::open(&config.buses, clock, &runtime).map_err(|e| Error::start("the I/O", e))?;
+        // Plants that are components: the I/O knows no sandbox, the lab's library joins the two.
+        let plants = Library::new(engine.clone(), bumpless_lab::folders(None));
+        let buses = config.buses.clone();
+        let server = blocking(move || IoServer::open_with(&buses, clock, &runtime, &plants))
+            .await?
+            .map_err(|e| Error::start("the I/O", e))?;
         Some(Arc::new(server))
     } else {
         None

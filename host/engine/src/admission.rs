@@ -19,6 +19,9 @@ const OFFERED: [&str; 6] = ["types", "io", "timer", "net", "alarm", "log"];
 /// The interface that it must export, with its functions.
 const EXPORT: &str = "bumpless:control/control@0.1.0";
 const FUNCTIONS: [&str; 4] = ["describe", "start", "step", "migrate"];
+/// The interface that a plant must export, with its functions.
+const PLANT_EXPORT: &str = "bumpless:control/process@0.1.0";
+const PLANT_FUNCTIONS: [&str; 3] = ["describe-plant", "begin", "advance"];
 
 /// What an inspection found: a controller that can be prepared on this host.
 #[derive(Debug, Clone, PartialEq)]
@@ -97,10 +100,19 @@ fn cure(name: &str) -> &'static str {
 
 /// The export must be there and hold the functions; their types are checked when the bindings look them up.
 pub(crate) fn check_export(component: &Component) -> Result<(), Error> {
-    let world = |reason: String| Err(Error::World { reason });
+    check_interface(component, EXPORT, &FUNCTIONS).map_err(|reason| Error::World { reason })
+}
+
+/// As [`check_export`], for a plant.
+pub(crate) fn check_plant_export(component: &Component) -> Result<(), Error> {
+    check_interface(component, PLANT_EXPORT, &PLANT_FUNCTIONS).map_err(|reason| Error::PlantWorld { reason })
+}
+
+fn check_interface(component: &Component, export: &str, functions: &[&str]) -> Result<(), String> {
+    let world = |reason: String| Err(reason);
     let ty = component.component_type();
     let engine = component.engine();
-    let found = ty.get_export(engine, EXPORT).map(|e| e.ty);
+    let found = ty.get_export(engine, export).map(|e| e.ty);
     let Some(ComponentItem::ComponentInstance(instance)) = found else {
         let exports: Vec<String> = ty
             .exports(engine)
@@ -112,14 +124,14 @@ pub(crate) fn check_export(component: &Component) -> Result<(), Error> {
         } else {
             exports.join(", ")
         };
-        return world(format!("it must export the interface {EXPORT}; it exports {exports}"));
+        return world(format!("it must export the interface {export}; it exports {exports}"));
     };
-    for function in FUNCTIONS {
+    for function in functions {
         if !matches!(
-            instance.get_export(engine, function).map(|e| e.ty),
+            instance.get_export(engine, *function).map(|e| e.ty),
             Some(ComponentItem::ComponentFunc(_))
         ) {
-            return world(format!("its export {EXPORT} lacks the function {function}"));
+            return world(format!("its export {export} lacks the function {function}"));
         }
     }
     Ok(())

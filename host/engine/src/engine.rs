@@ -14,7 +14,7 @@ use bumpless_core::Digest;
 use wasmtime::component::Component;
 
 use crate::{
-    Capacity, Config, Error, Inspection, Prepared, Profile,
+    Capacity, Config, Error, Inspection, Prepared, PreparedPlant, Profile,
     admission::check_bytes,
     cache::{Cache, deserialize},
     capacity::{Places, Turnstile},
@@ -168,8 +168,27 @@ impl Engine {
         self.0.profile
     }
 
-    /// From bytes to a described component; with the time of the compilation where there was one.
+    /// Makes a simulated plant ready for instances, from the cache or the compiler. It takes no place among the prepared
+    /// components: a plant is used by one bus or one experiment, which keeps what this gives.
+    ///
+    /// # Errors
+    /// Everything that makes bytes no acceptable plant; the text says what and what to do.
+    pub fn open_plant(&self, bytes: &[u8]) -> Result<Arc<PreparedPlant>, Error> {
+        let (plant, _) = self.make_as(bytes, PreparedPlant::new)?;
+        Ok(Arc::new(plant))
+    }
+
+    /// From bytes to a described controller; with the time of the compilation where there was one.
     fn make(&self, bytes: &[u8]) -> Result<(Prepared, Option<Duration>), Error> {
+        self.make_as(bytes, Prepared::new)
+    }
+
+    /// From bytes to a described component of a world: `new` checks and describes it.
+    fn make_as<T>(
+        &self,
+        bytes: &[u8],
+        new: impl Fn(Arc<Core>, Digest, &Component) -> Result<T, Error>,
+    ) -> Result<(T, Option<Duration>), Error> {
         check_bytes(bytes, &self.0.core.limits)?;
         let digest = Digest::of(bytes);
         let core = &self.0.core;
@@ -181,14 +200,14 @@ impl Engine {
                 .and_then(|cache| cache.load(&digest, &core.engine))
         };
         if let Some(component) = cached() {
-            return Ok((Prepared::new(Arc::clone(core), digest, &component)?, None));
+            return Ok((new(Arc::clone(core), digest, &component)?, None));
         }
         // One whole compilation may be ahead of this one; more is a crowd.
         let turn = self.0.compilations.enter(limits.compile_time_max * 2)?;
         // It may have been this very component.
         if let Some(component) = cached() {
             drop(turn);
-            return Ok((Prepared::new(Arc::clone(core), digest, &component)?, None));
+            return Ok((new(Arc::clone(core), digest, &component)?, None));
         }
         let started = Instant::now();
         let exchange_in = self
@@ -206,7 +225,7 @@ impl Engine {
         )?;
         let compile_time = started.elapsed();
         let component = self.load(&code)?;
-        let prepared = Prepared::new(Arc::clone(core), digest, &component)?;
+        let prepared = new(Arc::clone(core), digest, &component)?;
         // Only what passed every check is kept.
         if let Some(cache) = &self.0.cache {
             cache.store(&digest, &code);

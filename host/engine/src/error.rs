@@ -41,6 +41,18 @@ pub enum Error {
         /// Which import or export, and how it differs.
         reason: String,
     },
+    /// Imports or exports do not fit the world of plants.
+    #[error("this is no plant of the world bumpless:control@0.1.0: {reason}")]
+    PlantWorld {
+        /// Which import or export, and how it differs.
+        reason: String,
+    },
+    /// What a plant says of itself makes no sense.
+    #[error("what the plant says of itself is not acceptable: {reason}")]
+    PlantInfo {
+        /// What, and how it should be.
+        reason: String,
+    },
     /// More core instances, memories or tables than one component may have, or a first memory over the limit.
     #[error("the component needs more than an instance may have: {reason}")]
     Needs {

@@ -11,6 +11,8 @@
 //!                       └─ instantiate ─▶ Instance (one per replica) ─ start / step / migrate ─▶ state, effects or fault
 //! ```
 //!
+//! A simulated plant goes the same way with its own world: `open_plant`, then `instantiate`, `begin`, `advance` (`plant`).
+//!
 //! Reading order: `config`, `engine`, `admission`, `prepared`, `instance`; below them `profile`, `compile` with
 //! `compile_child`, `cache`, `ticker`, `sandbox`, `imports`; `convert` alone joins generated types and the core's nouns.
 
@@ -26,6 +28,8 @@ mod engine;
 mod error;
 mod imports;
 mod instance;
+mod plant;
+mod plant_bindings;
 mod prepared;
 mod profile;
 mod sandbox;
@@ -39,6 +43,7 @@ pub use config::{Compile, Config, Limits};
 pub use engine::Engine;
 pub use error::Error;
 pub use instance::{Instance, Origin};
+pub use plant::{PlantInfo, PlantInstance, PlantRole, PlantSignal, PlantView, PreparedPlant};
 pub use prepared::Prepared;
 pub use profile::Profile;
 
@@ -47,6 +52,8 @@ const _: () = {
     const fn send<T: Send>() {}
     const fn shared<T: Send + Sync>() {}
     send::<Instance>();
+    send::<PlantInstance>();
+    shared::<PreparedPlant>();
     shared::<Engine>();
     shared::<Prepared>();
 };

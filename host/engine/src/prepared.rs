@@ -181,7 +181,8 @@ impl Failed {
     }
 }
 
-fn make(core: &Core, pre: &ControllerPre<Sandbox>, ports: Arc<[PortFace]>, deadline: Instant) -> Result<Live, Failed> {
+/// A store within its bounds; whatever runs in it must be over at `deadline`.
+pub(crate) fn store(core: &Core, ports: Arc<[PortFace]>, deadline: Instant) -> Store<Sandbox> {
     let mut store = Store::new(&core.engine, Sandbox::new(&core.limits, ports, deadline));
     store.limiter(|sandbox| sandbox);
     store.set_hostcall_fuel(CALL_BYTES_MAX);
@@ -194,6 +195,11 @@ fn make(core: &Core, pre: &ControllerPre<Sandbox>, ports: Arc<[PortFace]>, deadl
         })
     });
     store.set_epoch_deadline(1);
+    store
+}
+
+fn make(core: &Core, pre: &ControllerPre<Sandbox>, ports: Arc<[PortFace]>, deadline: Instant) -> Result<Live, Failed> {
+    let mut store = store(core, ports, deadline);
     match pre.instantiate(&mut store) {
         Ok(guest) => Ok(Live { store, guest }),
         Err(error) => Err(Failed {

@@ -21,7 +21,7 @@ use crate::{
     job::JobConfig,
     limits::{BUSES_MAX, FORCE_NS_MAX, POINTS_MAX},
     modbus::{Plan, PlannedPoint, Transport, driver::ModbusDriver},
-    sim::driver::SimDriver,
+    sim::{ModelMaker, NoModels, driver::SimDriver},
 };
 
 /// What is known of a point.
@@ -129,6 +129,19 @@ impl IoServer {
     /// # Errors
     /// `Error::Config` names the bus or point that is wrong, `Error::Journal` a file that cannot be made.
     pub fn open(config: &Config, clock: Clock, runtime: &tokio::runtime::Handle) -> Result<Self, Error> {
+        Self::open_with(config, clock, runtime, &NoModels)
+    }
+
+    /// As [`IoServer::open`], with someone who makes the models that simulated buses name.
+    ///
+    /// # Errors
+    /// As [`IoServer::open`]; what the maker says comes as `Error::Config` of the bus.
+    pub fn open_with(
+        config: &Config,
+        clock: Clock,
+        runtime: &tokio::runtime::Handle,
+        models: &dyn ModelMaker,
+    ) -> Result<Self, Error> {
         if config.buses.len() > BUSES_MAX {
             let problem = format!(
                 "{} buses are configured; at most {BUSES_MAX} are possible",
@@ -155,7 +168,7 @@ impl IoServer {
                 ));
             }
             let (bus, infos) = match bus {
-                BusConfig::Sim(sim) => SimDriver::open(sim, clock.now_ns())
+                BusConfig::Sim(sim) => SimDriver::open(sim, clock.now_ns(), models)
                     .map(|(driver, infos)| (Prepared::Sim(Box::new(driver)), infos))?,
                 BusConfig::ModbusTcp(modbus) => modbus
                     .plan(Transport::Tcp)

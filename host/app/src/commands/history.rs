@@ -106,7 +106,7 @@ pub(crate) fn run(client: &Client, json: bool, what: HistoryCommand) -> Result<(
     }
 }
 
-fn path(name: &str, rest: &str) -> String {
+pub(crate) fn path(name: &str, rest: &str) -> String {
     format!("/v1/loops/{}{rest}", encoded(name))
 }
 
@@ -137,7 +137,7 @@ pub(super) fn parameters(
 }
 
 /// Waits until a shadow has ended.
-fn waited(client: &Client, name: &str, started: &Shadow) -> Result<Answer, Error> {
+pub(crate) fn waited(client: &Client, name: &str, started: &Shadow) -> Result<Answer, Error> {
     let found: Loop = client.get(&path(name, ""))?.decode()?;
     let cycles_s = found.spec.period_ms * 1e-3 * started.cycles_wanted as f64;
     let longest = Duration::try_from_secs_f64(cycles_s * 2.0)
@@ -260,7 +260,7 @@ fn list(found: &Shadows) -> Result<(), Error> {
     show::print(&table)
 }
 
-fn shadow(json: bool, answer: &Answer, plot: Option<&Path>) -> Result<(), Error> {
+pub(crate) fn shadow(json: bool, answer: &Answer, plot: Option<&Path>) -> Result<(), Error> {
     let found: Shadow = answer.decode()?;
     if !json {
         let state = found.ended.as_deref().unwrap_or("it follows");

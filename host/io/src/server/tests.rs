@@ -5,7 +5,7 @@
 use bumpless_core::{NoData, Quality};
 
 use super::*;
-use crate::sim::{FopdtSettings, SimConfig};
+use crate::sim::{FopdtSettings, NoModels, SimConfig};
 
 const MS: u64 = 1_000_000;
 
@@ -199,7 +199,7 @@ fn same_seed_times_and_writes_give_the_same_readings() {
             seed,
             ..SimConfig::pilot_plant(BusId::new("plant").unwrap())
         };
-        let (driver, infos) = SimDriver::open(&config, 1_000).unwrap();
+        let (driver, infos) = SimDriver::open(&config, 1_000, &NoModels).unwrap();
         let p2 = infos.iter().position(|p| p.id.as_str() == "plant.p2").unwrap();
         let mut values = Vec::new();
         for n in 0..300_u64 {
@@ -218,7 +218,7 @@ fn same_seed_times_and_writes_give_the_same_readings() {
 #[test]
 fn after_a_long_pause_the_plant_goes_on_from_where_it_stood() {
     let config = SimConfig::pilot_plant(BusId::new("plant").unwrap());
-    let (driver, infos) = SimDriver::open(&config, 0).unwrap();
+    let (driver, infos) = SimDriver::open(&config, 0, &NoModels).unwrap();
     let level = infos.iter().position(|p| p.id.as_str() == "plant.lit125").unwrap();
     let hour_ns = 3_600_000 * MS;
     let reading = driver.read(level, hour_ns);

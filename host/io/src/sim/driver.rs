@@ -6,12 +6,17 @@
 //!
 //! Never: checks ranges; the server did.
 
-use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+use std::{
+    sync::atomic::{AtomicU64, Ordering::Relaxed},
+    time::Duration,
+};
 
 use bumpless_core::{BusId, LoopId, NoData, PointId, PortKind, Quality, Reading};
 use parking_lot::Mutex;
 
-use super::{Command, Fopdt, Instrument, Plant, SimConfig, plant::STEP_NS};
+use super::{
+    Command, Fopdt, Instrument, ModelMaker, Plant, PlantChoice, SignalRole, SimConfig, pace::Paced, plant::STEP_NS,
+};
 use crate::{
     Error,
     config::OnStop,
@@ -24,7 +29,7 @@ use crate::{
 
 /// What a plant's point stands for.
 #[derive(Debug, Clone, Copy)]
-enum Role {
+pub(super) enum Role {
     Measures(Instrument),
     LowLevel,
     Sets(Command),
@@ -32,10 +37,10 @@ enum Role {
 }
 
 /// One row of the plant's point table: name, role, unit, range, text.
-type Row = (&'static str, Role, &'static str, f64, f64, &'static str);
+pub(super) type Row = (&'static str, Role, &'static str, f64, f64, &'static str);
 
 /// The plant's points, in the order in which they are listed.
-const PLANT_POINTS: [Row; 19] = [
+pub(super) const PLANT_POINTS: [Row; 19] = [
     (
         "pit118",
         Role::Measures(Instrument::Pit118),
@@ -219,7 +224,12 @@ enum Model {
     Plant(Box<Mutex<Course>>),
     /// Each loop behind its own lock, so that loops on several threads do not wait for each other.
     Fopdt(Box<[Mutex<Fopdt>]>),
+    /// A model from elsewhere, on a thread of its own.
+    Paced(Paced),
 }
+
+/// Time between two steps of a model from elsewhere, where the configuration does not say.
+const MODEL_STEP_MS: u64 = 10;
 
 /// A simulated bus at work.
 #[derive(Debug)]
@@ -238,10 +248,15 @@ const FOPDT_POINTS: usize = 3;
 
 impl SimDriver {
     /// Checks the configuration and starts the model at `start_ns`; returns the point table too.
-    pub(crate) fn open(config: &SimConfig, start_ns: u64) -> Result<(Self, Vec<PointInfo>), Error> {
+    pub(crate) fn open(
+        config: &SimConfig,
+        start_ns: u64,
+        maker: &dyn ModelMaker,
+    ) -> Result<(Self, Vec<PointInfo>), Error> {
         config.check()?;
-        let (model, infos) = match &config.fopdt {
-            Some(settings) => {
+        let (model, infos) = match (&config.fopdt, &config.plant) {
+            (None, Some(PlantChoice::Model(name))) => paced(config, name, start_ns, maker)?,
+            (Some(settings), _) => {
                 let processes = (0..settings.count)
                     .map(|n| Mutex::new(Fopdt::new(settings, config.seed, u64::from(n), start_ns)))
                     .collect();
@@ -277,8 +292,12 @@ impl SimDriver {
                 }
                 (Model::Fopdt(processes), infos)
             }
-            None => {
-                let plant = Plant::new(config.plant.unwrap_or_default(), config.seed);
+            (None, choice) => {
+                let settings = match choice {
+                    Some(PlantChoice::Pilot(settings)) => *settings,
+                    _ => super::PlantSettings::default(),
+                };
+                let plant = Plant::new(settings, config.seed);
                 let infos = PLANT_POINTS
                     .iter()
                     .map(|(name, role, unit, low, high, text)| {
@@ -344,6 +363,7 @@ impl SimDriver {
                 };
                 Reading::good(value, now_ns)
             }
+            Model::Paced(model) => model.read(point, now_ns),
         }
     }
 
@@ -372,6 +392,12 @@ impl SimDriver {
                         2 => process.lock().set_load(value, now_ns),
                         _ => continue,
                     }
+                    self.note(point, value, stamp, now_ns, taken(asked));
+                }
+            }
+            Model::Paced(model) => {
+                for Put { point, value, asked } in writes {
+                    model.set(point, value);
                     self.note(point, value, stamp, now_ns, taken(asked));
                 }
             }
@@ -410,6 +436,12 @@ impl SimDriver {
         status.polls = self.readings.load(Relaxed);
         status.writes = self.writes.load(Relaxed);
         status.journal_dropped = self.journal.as_ref().map_or(0, Journal::dropped);
+        if let Model::Paced(model) = &self.model
+            && let Some(reason) = model.halted()
+        {
+            status.connected = false;
+            status.last_error = Some(reason);
+        }
         status
     }
 
@@ -435,7 +467,16 @@ impl SimDriver {
                         now_ns,
                     );
                 }
+                Model::Paced(model) => {
+                    let outputs = model.signals().iter().enumerate();
+                    let outputs = outputs.filter(|(_, s)| s.role == SignalRole::Sets);
+                    let safe = outputs.map(|(n, s)| Put::plain(n, 0.0_f64.clamp(s.low, s.high)));
+                    self.write(safe, &stamp, now_ns);
+                }
             }
+        }
+        if let Model::Paced(model) = &self.model {
+            model.stop();
         }
         if let Some(journal) = &self.journal {
             journal.close();
@@ -443,13 +484,44 @@ impl SimDriver {
     }
 }
 
-/// An instrument's reading, from its current. The last good value is the true one: a sound transmitter would show it.
+/// A model from elsewhere, with its points.
+fn paced(
+    config: &SimConfig,
+    name: &str,
+    start_ns: u64,
+    maker: &dyn ModelMaker,
+) -> Result<(Model, Vec<PointInfo>), Error> {
+    let wrong = |problem: String| Error::config(format!("bus {:?}", config.id), problem);
+    let model = maker.make(name, &config.constants, config.seed).map_err(wrong)?;
+    let step = Duration::from_millis(config.step_ms.unwrap_or(MODEL_STEP_MS));
+    let model = Paced::start(model, config.id.as_str(), step, start_ns)
+        .map_err(|error| wrong(format!("the plant's thread cannot be started ({error})")))?;
+    let infos = model
+        .signals()
+        .iter()
+        .map(|s| {
+            let writable = s.role != SignalRole::Measures;
+            info(
+                &config.id,
+                &s.name,
+                &s.unit,
+                (s.low, s.high),
+                writable,
+                s.digital,
+                &s.text,
+            )
+        })
+        .collect::<Result<_, _>>()?;
+    Ok((Model::Paced(model), infos))
+}
+
 /// The end of a write that the actuator got.
 fn taken(asked: Option<f64>) -> LineEnd {
     asked.map_or(LineEnd::Taken, LineEnd::Forced)
 }
 
-fn measured(plant: &Plant, instrument: Instrument, low: f64, high: f64, at_ns: u64) -> Reading {
+/// An instrument's reading, from its current. The last good value is the true one: a sound transmitter would show it.
+pub(super) fn measured(plant: &Plant, instrument: Instrument, low: f64, high: f64, at_ns: u64) -> Reading {
     let Some(scaling) = Scaling::range([4.0, 20.0], low, high, Signal::Current, false) else {
         return Reading::missing(NoData::OutOfRange, 0.0, at_ns);
     };

@@ -7,7 +7,10 @@ use std::collections::VecDeque;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{limits::FOPDT_CHANGES_MAX, sim::noise};
+use crate::{
+    limits::{DEAD_TIME_S_MAX, FOPDT_CHANGES_MAX, FOPDT_COUNT_MAX},
+    sim::noise,
+};
 
 /// `tau · dy/dt + y = gain · u(t − dead time) + load`, all in % of span.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -34,6 +37,32 @@ impl Default for FopdtSettings {
             dead_time_s: 0.1,
             noise: 0.0,
         }
+    }
+}
+
+impl FopdtSettings {
+    /// Checks the numbers.
+    ///
+    /// # Errors
+    /// In words, where one makes no sense.
+    pub fn check(&self) -> Result<(), String> {
+        let wrong = |problem: String| Err(problem);
+        if !(1..=FOPDT_COUNT_MAX).contains(&self.count) {
+            return wrong(format!("fopdt.count must be 1 to {FOPDT_COUNT_MAX}"));
+        }
+        if !(self.gain.is_finite() && self.gain != 0.0) {
+            return wrong("fopdt.gain must be a number other than 0".to_owned());
+        }
+        if !(self.tau_s.is_finite() && self.tau_s > 0.0) {
+            return wrong("fopdt.tau_s must be greater than 0 seconds".to_owned());
+        }
+        if !(0.0..=DEAD_TIME_S_MAX).contains(&self.dead_time_s) {
+            return wrong(format!("fopdt.dead_time_s must be 0 to {DEAD_TIME_S_MAX} seconds"));
+        }
+        if !(self.noise.is_finite() && self.noise >= 0.0) {
+            return wrong("fopdt.noise must be 0 or more".to_owned());
+        }
+        Ok(())
     }
 }
 
@@ -158,7 +187,7 @@ impl Fopdt {
     }
 
     /// The exact solution with the present input.
-    fn value_at(&self, at_ns: u64) -> f64 {
+    pub(crate) fn value_at(&self, at_ns: u64) -> f64 {
         let rest = self.gain * self.acting_output + self.acting_load;
         let passed_ns = at_ns.saturating_sub(self.value_at_ns) as f64;
         rest + (self.value - rest) * (-passed_ns / self.tau_ns).exp()

@@ -106,6 +106,26 @@ impl Default for PlantSettings {
     }
 }
 
+impl PlantSettings {
+    /// Checks the numbers.
+    ///
+    /// # Errors
+    /// In words, where one makes no sense.
+    pub fn check(&self) -> Result<(), String> {
+        let wrong = |problem: &str| Err(problem.to_owned());
+        if !(8..=24).contains(&self.adc_bits) {
+            return wrong("plant.adc_bits must be 8 to 24");
+        }
+        if !(20.0..=80.0).contains(&self.water_l) {
+            return wrong("plant.water_l must be 20 to 80 litres: the tank below holds 83");
+        }
+        if !(0.0..=10.0).contains(&self.noise) {
+            return wrong("plant.noise must be 0 to 10; 1 is the noise of real instruments");
+        }
+        Ok(())
+    }
+}
+
 /// Everything that can be set.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Command {
