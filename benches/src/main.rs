@@ -15,6 +15,7 @@ mod history;
 mod lab;
 mod law;
 mod local;
+mod page;
 mod peer;
 mod report;
 mod rest;
@@ -59,6 +60,8 @@ enum Bench {
     /// With --hz, --count or --kill: hundreds on one fast loop, also while its owner is killed, then components that go wrong
     /// on probation.
     Swap(switch::Switching),
+    /// The operator's page with 50 loops: first paint, frames, processor, memory; and what 30 readers do to the cycles.
+    Page(page::Watching),
     /// From an upload to the first cycle, what running loops feel of it, bombs, and many uploads at once.
     Upload,
     /// Virtual time: hours of the pilot plant per second and core, against the same experiment as plain functions.
@@ -130,6 +133,7 @@ fn run(bench: &Bench, options: Options) -> Result<bool, Error> {
         Bench::Lab => "lab",
         Bench::Step => "step",
         Bench::Upload => "upload",
+        Bench::Page(_) => "page",
         Bench::Burn { core } => return stress::burn(*core).map(|()| true),
         Bench::CallPeer { component } => return peer::run(component).map(|()| true),
     };
@@ -144,6 +148,7 @@ fn run(bench: &Bench, options: Options) -> Result<bool, Error> {
         Bench::Lab => lab::run(options, &mut report)?,
         Bench::Step => step::run(options, &mut report)?,
         Bench::Upload => upload::run(options, &mut report)?,
+        Bench::Page(watching) => page::run(options, *watching, &mut report)?,
         Bench::CallPeer { .. } | Bench::Burn { .. } => {}
     }
     Ok(report.end())

@@ -152,7 +152,7 @@ fn files() -> Vec<PathBuf> {
             let name = entry.file_name().to_string_lossy().into_owned();
             let kind = entry.file_type().unwrap();
             if kind.is_dir() {
-                if !["target", ".git", ".bumpless", "node_modules", "__pycache__"].contains(&name.as_str()) {
+                if !["target", ".git", ".bumpless", "node_modules", "dist", "__pycache__"].contains(&name.as_str()) {
                     walk(&entry.path(), found);
                 }
             } else if kind.is_file() {

@@ -2,7 +2,7 @@
 
 use std::{collections::BTreeMap, time::Duration};
 
-use bumpless_tests::{Api, Cell, CellOptions, first_order_loop, repository};
+use bumpless_tests::{Api, Cell, CellOptions, Feed, first_order_loop, repository};
 use serde_json::Value;
 
 use crate::{names, whole};
@@ -60,6 +60,7 @@ fn metrics_count_the_document_fits_and_the_feed_resumes() {
     owners_measure_steps(&cell);
     the_document_fits(&api);
     the_feed_resumes(&api);
+    the_feed_in_rows_resumes_at_another_host(&mut cell);
 }
 
 fn metrics_count(api: &Api) {
@@ -187,4 +188,55 @@ fn the_feed_resumes(api: &Api) {
     assert!(quiet >= 3, "{times:?}");
     let with_state = api.live("?loops=loop-1&state=true").unwrap().record().unwrap();
     assert!(with_state["state"].is_string() && record["state"].is_null());
+}
+
+/// The rows of the traced loop as they come, until `enough` of their cycles; the last id too.
+fn traced(api: &Api, last_event_id: Option<&str>, enough: usize) -> (Vec<u64>, String) {
+    let url = format!("{}/v1/live?form=rows&trace=loop-1&every_ms=100", api.base());
+    let feed = Feed::open(&url, last_event_id).unwrap();
+    let mut seqs = Vec::new();
+    loop {
+        let event = feed.next(Duration::from_secs(10)).unwrap();
+        if event.name == "rows" {
+            let rows = event.data["trace"].as_array().unwrap();
+            seqs.extend(rows.iter().map(|row| whole(&row["seq"])));
+            assert_eq!(event.data["lost"], 0, "nobody was too slow");
+            if seqs.len() >= enough {
+                return (seqs, event.id);
+            }
+        }
+    }
+}
+
+#[track_caller]
+fn no_gap(seqs: &[u64]) {
+    assert!(
+        seqs.windows(2).all(|pair| pair[1] == pair[0] + 1),
+        "a cycle is missing or comes twice: {seqs:?}"
+    );
+}
+
+/// A page whose host dies goes on at another: what it missed comes from the log of the loop's home.
+fn the_feed_in_rows_resumes_at_another_host(cell: &mut Cell) {
+    let plant = cell.api().unwrap();
+    let (first, id) = traced(&plant, None, 10);
+    no_gap(&first);
+    let last = *first.last().unwrap();
+    plant
+        .wait_for_loop("loop-1", "cycles that nobody reads", |view| {
+            view["seq"].as_u64() > Some(last + 20)
+        })
+        .unwrap();
+    let other = cell.api_of("a").unwrap();
+    let (second, _) = traced(&other, Some(&id), 40);
+    let both: Vec<u64> = first.into_iter().chain(second).collect();
+    no_gap(&both);
+    // What it met before it was asked is remembered: the first owner at least.
+    let told = plant.get("/v1/notices").unwrap();
+    let first_owner = told["notices"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .any(|notice| notice["kind"] == "took-over");
+    assert!(first_owner, "{told}");
 }

@@ -1,7 +1,7 @@
 //! `cargo xtask test`: everything that has to hold, in the order in which a fault shows soonest.
 //!
 //! ```text
-//!   tools ─► format ─► dependencies ─► components ─► clippy ─► build ─► tests ─► documentation
+//!   tools ─► format ─► dependencies ─► components ─► page ─► clippy ─► build ─► tests ─► page in a browser ─► documentation
 //! ```
 //! Owns the list of steps and what each needs set up. One step after the other: they share one target folder and two
 //! cores. The first that fails ends the run. Never: changes a source file.
@@ -9,18 +9,19 @@
 use std::time::{Duration, Instant};
 
 use crate::{
-    Error, components, deny,
+    Error, components, deny, page,
     run::{cargo, output, program, run, say},
 };
 
 /// A step: name, whether the quick run has it, and what it does.
 type Step = (&'static str, bool, fn(fast: bool) -> Result<(), Error>);
 
-const STEPS: [Step; 8] = [
+const STEPS: [Step; 10] = [
     ("tools", true, |_| tools()),
     ("format", true, |_| run(&mut cargo("fmt --all --check"))),
     ("dependencies", false, |_| deny::check()),
     ("components", true, |_| components::run().map_err(Error::from)),
+    ("page", true, |_| page::build()),
     ("clippy", true, |_| {
         run(&mut cargo(
             "clippy --workspace --all-targets --quiet -- --deny warnings",
@@ -31,6 +32,7 @@ const STEPS: [Step; 8] = [
         run(&mut cargo("build --workspace --all-targets --quiet"))
     }),
     ("tests", true, tests),
+    ("page in a browser", false, |_| page::test()),
     ("documentation", false, |_| {
         run(cargo("doc --workspace --no-deps --quiet").env("RUSTDOCFLAGS", "--deny warnings"))
     }),
@@ -74,7 +76,8 @@ fn summary(times: &[(&str, Duration)], good: bool) {
     say(&format!("{:<16} {:>8.1} s  {word}", "together", total.as_secs_f64()));
 }
 
-/// What the other steps need: rustfmt, clippy, the components' target, and Python for the independent Modbus device.
+/// What the other steps need: rustfmt, clippy, the components' target, Python for the independent Modbus device, Node
+/// for the page.
 fn tools() -> Result<(), Error> {
     for (tool, component) in [("fmt", "rustfmt"), ("clippy", "clippy")] {
         if output(cargo(tool).arg("--version")).is_none() {
@@ -82,7 +85,12 @@ fn tools() -> Result<(), Error> {
         }
     }
     components::ensure_target()?;
-    for (name, argument) in [("rustc", "--version"), ("cargo", "--version"), ("python3", "--version")] {
+    for (name, argument) in [
+        ("rustc", "--version"),
+        ("cargo", "--version"),
+        ("python3", "--version"),
+        ("node", "--version"),
+    ] {
         let version = output(program(name).arg(argument)).ok_or_else(|| Error::Program {
             program: name.to_owned(),
             source: std::io::Error::from(std::io::ErrorKind::NotFound),

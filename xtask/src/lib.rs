@@ -4,6 +4,7 @@
 
 pub mod check;
 pub mod components;
+pub mod page;
 pub mod product;
 
 mod deny;

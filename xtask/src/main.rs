@@ -3,7 +3,7 @@
 use std::process::ExitCode;
 
 use clap::Parser;
-use xtask::{Error, check, components, product};
+use xtask::{Error, check, components, page, product};
 
 /// Sets up, builds and checks Bumpless.
 #[derive(Parser)]
@@ -42,6 +42,8 @@ enum Command {
         #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
         arguments: Vec<String>,
     },
+    /// Builds the operator's page, which the next build of the program embeds. Needs Node.
+    Page,
     /// Writes docs/openapi.json from the code.
     Openapi,
 }
@@ -54,6 +56,7 @@ fn main() -> ExitCode {
         Command::Bench { arguments } => product::bench(&arguments),
         Command::Model { arguments } => product::tool("bumpless-model", &arguments),
         Command::Simulate { arguments } => product::tool("bumpless-simulation", &arguments),
+        Command::Page => page::build(),
         Command::Openapi => product::openapi(),
     };
     match done {

@@ -3,7 +3,7 @@
 use std::process::Stdio;
 
 use crate::{
-    Error, components,
+    Error, components, page,
     run::{cargo, program, run, say, target_folder},
 };
 
@@ -14,6 +14,7 @@ use crate::{
 pub fn demo(arguments: &[String]) -> Result<(), Error> {
     say("building the components and the host…");
     let folder = components::build()?;
+    page::build_if_possible()?;
     run(&mut cargo("build --package bumpless-app"))?;
     let binary = target_folder().join("debug/bumpless");
     run(program(binary)
@@ -29,6 +30,7 @@ pub fn demo(arguments: &[String]) -> Result<(), Error> {
 /// What does not build, or a bound that does not hold.
 pub fn bench(arguments: &[String]) -> Result<(), Error> {
     components::build()?;
+    page::build_if_possible()?;
     // In one command, so that one set of features and one build of the dependencies serve both.
     run(&mut cargo(
         "build --release --package bumpless-app --package bumpless-bench",

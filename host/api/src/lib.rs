@@ -20,6 +20,7 @@ mod error;
 mod extract;
 mod gate;
 mod metrics;
+mod notices;
 mod openapi;
 #[allow(
     unused_qualifications,

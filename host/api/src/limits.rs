@@ -74,3 +74,51 @@ pub const PORT_TABLES_MAX: usize = 1_024;
 
 /// Characters of a header that is for people (`x-note`, `x-by`).
 pub const NOTE_CHARS_MAX: usize = 512;
+
+/// Notices that a host remembers: some 500 KiB, and hours of an ordinary day.
+pub const NOTICES_MAX: usize = 2_000;
+
+/// Notices of one event of a feed, and of one answer where nothing is said.
+pub const NOTICES_AT_ONCE: usize = 200;
+
+/// Alarms that are known as raised; more of them are told, but not remembered as standing.
+pub const STANDING_MAX: usize = 1_000;
+
+/// Loops of which is remembered what their last record met, so that it is not told again.
+pub const NOTICE_LOOPS_MAX: usize = 2_000;
+
+/// Shortest time between two beats of a feed in rows: a screen shows no more.
+pub const BEAT_MS_MIN: u32 = 50;
+
+/// Longest time between two beats.
+pub const BEAT_MS_MAX: u32 = 10_000;
+
+/// Time between two beats where the reader says nothing.
+pub const BEAT_MS_DEFAULT: u32 = 200;
+
+/// Loops whose every cycle one feed in rows carries: a page shows one or two.
+pub const TRACES_MAX: usize = 8;
+
+/// Cycles of one traced loop that wait for a slow reader; the oldest go first. Ten seconds of a 100 Hz loop.
+pub const TRACE_ROWS_MAX: usize = 1_000;
+
+/// Time for which one answer about where the loops stand serves all feeds.
+pub const STANDING_EVERY: Duration = Duration::from_secs(1);
+
+/// Longest wait for what a feed makes up for after a pause.
+pub const CATCH_UP_TIME_MAX: Duration = Duration::from_secs(3);
+
+/// Cycles that one answer about curves reads, a thousand at a time: 100 minutes of a 10 Hz loop.
+pub const TREND_CYCLES_MAX: u64 = 60_000;
+
+/// Longest time that one answer about curves reads for; then it answers what it has.
+pub const TREND_TIME_MAX: Duration = Duration::from_secs(8);
+
+/// Notices of one answer about curves.
+pub const TREND_NOTICES_MAX: usize = 500;
+
+/// Most pieces that a window of curves is told in: a wide screen has no more columns.
+pub const TREND_POINTS_MAX: usize = 4_000;
+
+/// Longest time that a fault of the demonstration lasts, in s.
+pub const FAULT_S_MAX: u32 = 60;

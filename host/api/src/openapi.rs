@@ -4,7 +4,7 @@ use utoipa::OpenApi;
 
 use crate::{
     error::Problem,
-    routes::{alarms, bundle, components, history, hosts, live, loops, pages, rollouts},
+    routes::{alarms, bundle, components, demo, history, hosts, live, loops, pages, rollouts, trend},
     types,
 };
 
@@ -24,10 +24,10 @@ use crate::{
         history::start_shadow, history::shadows, history::show_shadow, history::stop_shadow,
         rollouts::start, rollouts::list, rollouts::show, rollouts::stop,
         alarms::list, alarms::past, alarms::act, alarms::define, alarms::remove,
-        hosts::list, hosts::points, live::feed,
+        hosts::list, hosts::points, live::feed, trend::trend, trend::list_notices, demo::show, demo::fault,
         pages::healthz, pages::readyz, pages::metrics, pages::openapi,
     ),
-    components(schemas(Problem, types::Record, types::Hosts)),
+    components(schemas(Problem, types::Record, types::Hosts, types::LiveRows, types::Standing)),
     tags(
         (name = "components", description = "The library of control components"),
         (name = "loops", description = "Controllers bound to points"),

@@ -5,12 +5,15 @@
 pub(crate) mod alarms;
 pub(crate) mod bundle;
 pub(crate) mod components;
+pub(crate) mod demo;
 pub(crate) mod history;
 pub(crate) mod hosts;
 pub(crate) mod live;
 pub(crate) mod loops;
+pub(crate) mod page;
 pub(crate) mod pages;
 pub(crate) mod rollouts;
+pub(crate) mod trend;
 
 use axum::{
     Router,
@@ -67,9 +70,14 @@ pub(crate) fn all() -> Router<App> {
         .route("/v1/hosts", get(hosts::list))
         .route("/v1/points", get(hosts::points))
         .route("/v1/live", get(live::feed))
+        .route("/v1/loops/{name}/trend", get(trend::trend))
+        .route("/v1/notices", get(trend::list_notices))
+        .route("/v1/demo", get(demo::show))
+        .route("/v1/demo/faults", post(demo::fault))
         .route("/metrics", get(pages::metrics))
         .route("/openapi.json", get(pages::openapi))
-        .route("/", get(pages::index))
+        .route("/", get(page::index))
+        .merge(page::files())
 }
 
 /// Is the host alive, is it ready?

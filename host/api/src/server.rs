@@ -9,7 +9,7 @@ use std::{
     future::Future,
     panic::AssertUnwindSafe,
     sync::{Arc, Mutex, PoisonError},
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use axum::{
@@ -24,7 +24,7 @@ use bumpless_deploy::Deploy;
 use futures_util::FutureExt as _;
 use tokio::{
     net::TcpListener,
-    sync::{Semaphore, watch},
+    sync::{Semaphore, mpsc, watch},
 };
 
 use crate::{
@@ -36,18 +36,21 @@ use crate::{
         STOP_TIME_MAX, UPLOAD_TIME_MAX, UPLOADS_MAX,
     },
     metrics::Metrics,
+    notices::Notices,
     routes,
-    types::{PortTable, PortTables},
+    types::{Fault, PortTable, PortTables},
 };
 
 /// What the composition root decides about the API.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone)]
 #[non_exhaustive]
 pub struct Options {
     /// Requests worked on at once.
     pub requests_max: usize,
     /// Live feeds open at once.
     pub feeds_max: usize,
+    /// Who does the faults that are asked for; none in service, only the demonstration has one. A full queue refuses.
+    pub faults: Option<mpsc::Sender<Fault>>,
 }
 
 impl Default for Options {
@@ -55,6 +58,7 @@ impl Default for Options {
         Self {
             requests_max: REQUESTS_MAX,
             feeds_max: FEEDS_MAX,
+            faults: None,
         }
     }
 }
@@ -70,6 +74,12 @@ pub(crate) struct App {
     pub(crate) uploads: Arc<Semaphore>,
     /// Turns true when the host stops.
     pub(crate) stop: watch::Receiver<bool>,
+    /// What people should hear of.
+    pub(crate) notices: Arc<Notices>,
+    /// Where all loops stand, as JSON, and since when that is known.
+    pub(crate) standing: Arc<Mutex<Option<(Instant, Arc<str>)>>>,
+    /// Who does the faults of the demonstration.
+    pub(crate) faults: Option<mpsc::Sender<Fault>>,
     requests: Arc<Semaphore>,
     ports: Arc<Mutex<PortTables>>,
 }
@@ -82,6 +92,9 @@ impl App {
             uploads: Arc::new(Semaphore::new(UPLOADS_MAX)),
             requests: Arc::new(Semaphore::new(options.requests_max)),
             ports: Arc::default(),
+            notices: Arc::new(Notices::new()),
+            standing: Arc::default(),
+            faults: options.faults.clone(),
             stop,
             cell,
         }
@@ -143,6 +156,7 @@ pub(crate) async fn serve_cell(
     let (stopping, mut stop) = watch::channel(false);
     let app = App::new(Arc::clone(&cell), options, stop.clone());
     let follower = tokio::spawn(Arc::clone(&app.metrics).follow(cell, stop.clone()));
+    let listener_of_notices = tokio::spawn(Notices::follow(app.clone()));
     let graceful = async move {
         shutdown.await;
         // Nobody listens only when nothing is served any more.
@@ -165,6 +179,7 @@ pub(crate) async fn serve_cell(
         }
     };
     follower.abort();
+    listener_of_notices.abort();
     end
 }
 

@@ -5,9 +5,10 @@
 
 mod alarms;
 mod candidates;
-mod fake;
+pub(crate) mod fake;
 mod history;
 mod library;
+mod page;
 mod rollouts;
 
 use std::sync::{Arc, atomic::Ordering};

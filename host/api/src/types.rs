@@ -11,11 +11,13 @@ mod component;
 mod history;
 mod hosts;
 mod library;
+mod live;
 mod loops;
 mod record;
 mod rollouts;
 mod words;
 
+pub use crate::routes::demo::{Demo, Fault, FaultKind};
 pub use alarms::{
     AlarmActRequest, AlarmActWord, AlarmDefinition, AlarmFlood, AlarmHappening, AlarmHistory, AlarmKind, AlarmShelf,
     AlarmState, LoopAlarm, LoopAlarms,
@@ -28,6 +30,7 @@ pub use history::{
 };
 pub use hosts::{Host, Hosts, Point, Points};
 pub use library::{Admission, AdmissionFinding, ComponentEvent, ComponentHost, Import, Imports, RelabelRequest};
+pub use live::{LiveRow, LiveRows, Notice, Notices, Standing, Trend, Weight};
 pub use loops::{
     Apply, Command, Failure, HandOver, Loop, LoopDraft, Loops, ModeRequest, MoveRequest, OutputLimit, OutputRequest,
     Policy, RollbackRequest, SetRequest, SetpointRequest, SwapRequest, Tally,

@@ -117,6 +117,9 @@ pub(crate) struct HostArgs {
     /// Stop when the standard input closes: for a parent that holds the other end.
     #[arg(long, hide = true)]
     pub(crate) until_stdin_closes: bool,
+    /// Pass faults that are asked for over the API on to the parent, as lines on the standard output: for the demonstration.
+    #[arg(long, hide = true)]
+    pub(crate) faults_on_stdout: bool,
 }
 
 /// How log lines look.
@@ -143,6 +146,9 @@ pub(crate) struct DemoArgs {
     /// Start a host that died again.
     #[arg(long)]
     pub(crate) restart: bool,
+    /// Simulated tanks with a level loop each, beside the vessel.
+    #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u32).range(0..=200))]
+    pub(crate) tanks: u32,
 }
 
 /// What can be done with loops.

@@ -12,6 +12,7 @@ use std::{
     time::Duration,
 };
 
+use bumpless_api::types::Fault;
 use bumpless_cell::{Arrival, Roles, Session};
 use bumpless_deploy::{Deploy, DeployArrival, Parts};
 use bumpless_engine::Engine;
@@ -91,11 +92,12 @@ impl Outlets {
     }
 }
 
-/// Starts a host. When this returns, it has joined its cell and its API answers.
+/// Starts a host. When this returns, it has joined its cell and its API answers. `faults` is for the demonstration alone: who
+/// does what the API is asked for.
 ///
 /// # Errors
 /// The first room that does not start, with its own words; what was started before it ends with its last handle.
-pub async fn run(config: Config) -> Result<Running, Error> {
+pub async fn run(config: Config, faults: Option<mpsc::Sender<Fault>>) -> Result<Running, Error> {
     let clock = Clock::start();
     let data = config.data.clone();
     let store = blocking(move || Store::open(&data))
@@ -207,7 +209,9 @@ pub async fn run(config: Config) -> Result<Running, Error> {
         // An error means that the sender is gone, and so is the host.
         drop(stopping.wait_for(|stop| *stop).await);
     };
-    let serving = bumpless_api::serve(listener, deploy.clone(), bumpless_api::Options::default(), stopped);
+    let mut options = bumpless_api::Options::default();
+    options.faults = faults;
+    let serving = bumpless_api::serve(listener, deploy.clone(), options, stopped);
     let api_task = tokio::spawn(serving);
     Ok(Running {
         api,

@@ -1,5 +1,5 @@
 //! `demo`: a whole cell on this machine. A plant host with the simulated pilot plant, three controller hosts, the stock
-//! controllers in the library, and one loop that holds the vessel's pressure.
+//! controllers in the library, one loop that holds the vessel's pressure, and some tanks with a level loop each.
 //!
 //! ```text
 //! folder, ports ─► plant ready ─► a, b, c ready ─► upload ─► loop in force ─► addresses ─► watching the children
@@ -9,18 +9,20 @@
 //! The hosts are processes like any others: kill one and see. Never: touches anything outside of its folder.
 
 mod children;
+mod faults;
 
 use std::{
     fs,
     path::{Path, PathBuf},
-    sync::atomic::Ordering,
+    sync::{atomic::Ordering, mpsc},
     time::{Duration, Instant},
 };
 
-use bumpless_api::types::{Apply, Loop};
+use bumpless_api::types::{Apply, Fault, FaultKind, Loop, LoopDraft};
 
 use crate::{cli::DemoArgs, client::Client, commands, error::Error, show, stop};
 use children::{Cell, Plan};
+use faults::Faults;
 
 /// First port of the APIs; the plant's. Where one is taken, any free one serves.
 const FIRST_PORT: u16 = 8480;
@@ -30,6 +32,8 @@ const HOSTS: [&str; 4] = ["plant", "a", "b", "c"];
 const COMPONENTS: [&str; 3] = ["pidplus", "pid", "on-off"];
 /// Longest wait for the cell to be whole: a shared machine may have other work.
 const WHOLE_TIME_MAX: Duration = Duration::from_secs(30);
+/// Faults that wait to be done; more are dropped.
+const FAULTS_MAX: usize = 16;
 /// How often the children are looked at.
 const LOOK_EVERY: Duration = Duration::from_millis(100);
 
@@ -44,7 +48,8 @@ pub(crate) fn run(args: &DemoArgs) -> Result<(), Error> {
     let until = args.for_s.map(|seconds| Instant::now() + Duration::from_secs(seconds));
     let stopping = || stop.load(Ordering::Relaxed) || until.is_some_and(|until| Instant::now() >= until);
 
-    let plan = Plan::new(&dir, &HOSTS, FIRST_PORT)?;
+    let (wish, wishes) = mpsc::sync_channel::<Fault>(FAULTS_MAX);
+    let plan = Plan::new(&dir, &HOSTS, FIRST_PORT, args.tanks, wish)?;
     show::note(&format!("starting hosts {} in {}", HOSTS.join(", "), dir.display()));
     let mut cell = Cell::start(plan, &stop)?;
     let client = Client::new(cell.api(HOSTS[0]).unwrap_or_default())?;
@@ -63,9 +68,29 @@ pub(crate) fn run(args: &DemoArgs) -> Result<(), Error> {
     let draft = commands::loops::read(&file)?;
     let end: Apply = client.put("/v1/loops/pressure", &draft)?.decode()?;
     show::note(&format!("loop {} runs, revision {}", end.loop_name, end.revision));
+    for n in 0..args.tanks {
+        let draft = tank(n)?;
+        let _: Apply = client.put(&format!("/v1/loops/{}", draft.name), &draft)?.decode()?;
+    }
+    if args.tanks > 0 {
+        show::note(&format!("{} level loops run", args.tanks));
+    }
     tell(&cell, &dir)?;
 
+    let mut faults = Faults::default();
     while !stopping() {
+        while let Ok(fault) = wishes.try_recv() {
+            match faults.act(&fault, &cell) {
+                Ok(done) => show::line(&done)?,
+                Err(error) => show::note(&error.report()),
+            }
+            if fault.fault == FaultKind::Start {
+                told(cell.revive(Some(&fault.host), &stop))?;
+            }
+        }
+        for line in faults.look(&cell) {
+            show::line(&line)?;
+        }
         for death in cell.deaths() {
             show::line(&format!(
                 "{death}{}",
@@ -73,12 +98,7 @@ pub(crate) fn run(args: &DemoArgs) -> Result<(), Error> {
             ))?;
         }
         if args.restart {
-            for back in cell.revive(&stop) {
-                match back {
-                    Ok(name) => show::line(&format!("host {name} is back"))?,
-                    Err(error) => show::note(&error.report()),
-                }
-            }
+            told(cell.revive(None, &stop))?;
         }
         std::thread::sleep(LOOK_EVERY);
     }
@@ -95,6 +115,29 @@ pub(crate) fn run(args: &DemoArgs) -> Result<(), Error> {
     }
     cell.stop();
     Ok(())
+}
+
+/// Says who is back, or why not.
+fn told(revived: Vec<Result<String, Error>>) -> Result<(), Error> {
+    for back in revived {
+        match back {
+            Ok(name) => show::line(&format!("host {name} is back"))?,
+            Err(error) => show::note(&error.report()),
+        }
+    }
+    Ok(())
+}
+
+/// The level loop of a tank. Lambda tuning with lambda = 2 s: k = 6 / (0.9 · (2 + 0.4)) = 2.8 and ti = 6 s.
+fn tank(n: u32) -> Result<LoopDraft, Error> {
+    let text = format!(
+        "name = \"tank-{number}\"\ncomponent = \"pid\"\nperiod_ms = 200\nsetpoint = {setpoint}\nreplicas = 3\n\
+         [ports]\npv = \"tanks.{n}.pv\"\nout = \"tanks.{n}.out\"\n\
+         [parameters]\nk = 2.8\nti = 6.0\nout-low = 0.0\nout-high = 100.0\n",
+        number = n + 1,
+        setpoint = 30 + (n * 17) % 50,
+    );
+    toml::from_str(&text).map_err(|error| Error::Demo(format!("the loop of tank {}: {error}", n + 1)))
 }
 
 /// The folder of everything; a new one where none is named.
@@ -246,7 +289,11 @@ mod tests {
 
     #[test]
     fn the_loop_file_is_a_good_one() {
-        let draft: bumpless_api::types::LoopDraft = toml::from_str(LOOP_FILE).expect("a loop file");
+        let draft: LoopDraft = toml::from_str(LOOP_FILE).expect("a loop file");
         assert_eq!(draft.name, "pressure");
+        for n in [0, 4, 199] {
+            let draft = tank(n).expect("a loop file");
+            assert!((0.0..100.0).contains(&draft.setpoint), "{draft:?}");
+        }
     }
 }

@@ -11,8 +11,12 @@ use std::{
     time::Duration,
 };
 
+use bumpless_api::types::Fault;
 use serde::{Deserialize, Serialize};
-use tokio::signal::unix::{SignalKind, signal};
+use tokio::{
+    signal::unix::{SignalKind, signal},
+    sync::mpsc,
+};
 use tracing_subscriber::EnvFilter;
 
 use crate::{
@@ -27,6 +31,9 @@ use crate::{
 const LOG_DEFAULT: &str = "info,zenoh=warn,zenoh_transport=error,zenoh_link_commons=error";
 /// Tasks of the runtime get this long to end once everything is stopped.
 const RUNTIME_STOP_TIME_MAX: Duration = Duration::from_secs(2);
+
+/// Faults on their way to the parent, who does them one after the other; more are refused.
+const FAULTS_MAX: usize = 8;
 
 /// What a host prints, as one line of JSON, once it has joined its cell and its API answers.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -65,7 +72,7 @@ pub(crate) fn run(args: &HostArgs) -> Result<(), Error> {
         .thread_name("async")
         .build()
         .map_err(|error| Error::start("the async runtime", error))?;
-    let end = runtime.block_on(live(config, args.until_stdin_closes));
+    let end = runtime.block_on(live(config, args.until_stdin_closes, args.faults_on_stdout));
     runtime.shutdown_timeout(RUNTIME_STOP_TIME_MAX);
     end
 }
@@ -84,14 +91,14 @@ fn log(format: LogFormat) {
     };
 }
 
-async fn live(config: Config, until_stdin_closes: bool) -> Result<(), Error> {
+async fn live(config: Config, until_stdin_closes: bool, faults_on_stdout: bool) -> Result<(), Error> {
     // Before anything is started, so that no signal is missed.
     let mut terminate = signal(SignalKind::terminate()).map_err(|error| Error::start("the signal handler", error))?;
     let mut interrupt = signal(SignalKind::interrupt()).map_err(|error| Error::start("the signal handler", error))?;
     let parent_gone = parent_gone(until_stdin_closes)?;
 
     let (host, wish) = (config.host.clone(), config.realtime);
-    let mut running = compose::run(config).await?;
+    let mut running = compose::run(config, faults_on_stdout.then(pass_faults_on)).await?;
     realtime::raise(wish)?;
     let ready = Ready {
         ready: true,
@@ -110,6 +117,20 @@ async fn live(config: Config, until_stdin_closes: bool) -> Result<(), Error> {
     running.stop().await;
     tracing::info!("stopped");
     end
+}
+
+/// Passes faults on to the parent, one JSON line each. Ends with the API.
+fn pass_faults_on() -> mpsc::Sender<Fault> {
+    let (faults, mut asked) = mpsc::channel::<Fault>(FAULTS_MAX);
+    tokio::spawn(async move {
+        while let Some(fault) = asked.recv().await {
+            let line = serde_json::to_string(&fault).unwrap_or_default();
+            if let Err(error) = show::line(&line) {
+                tracing::warn!(%error, "a fault could not be passed on");
+            }
+        }
+    });
+    faults
 }
 
 /// Ends when the standard input does. A thread waits, for the standard input cannot be waited for otherwise.

@@ -1,18 +1,21 @@
 //! `/v1/live`: records as server-sent events, as they leave the arbiters.
 //!
-//! A feed never holds the cell up: whoever reads too slowly loses the oldest records and is told how many (`lost`).
+//! `form=rows` is the feed for pages: see `rows`. A feed never holds the cell up: whoever reads too slowly loses the oldest records and is told how many (`lost`).
+
+mod rows;
 
 use std::{
     collections::{HashMap, HashSet},
     convert::Infallible,
     sync::Arc,
+    time::Duration,
 };
 
 use axum::{
     extract::State,
-    http::HeaderName,
+    http::{HeaderMap, HeaderName},
     response::{
-        IntoResponse,
+        IntoResponse as _, Response,
         sse::{Event, KeepAlive, Sse},
     },
 };
@@ -27,15 +30,17 @@ use tokio::{
     },
     time::{Interval, MissedTickBehavior},
 };
-use utoipa::IntoParams;
+use utoipa::{IntoParams, ToSchema};
 
 use crate::{
     error::{Kind, Problem},
     extract::InQuery,
-    limits::{FEED_LOOPS_MAX, HOSTS_EVERY, KEEP_ALIVE},
+    limits::{BEAT_MS_DEFAULT, BEAT_MS_MAX, BEAT_MS_MIN, FEED_LOOPS_MAX, HOSTS_EVERY, KEEP_ALIVE, TRACES_MAX},
     server::App,
     types::{Hosts, Record},
 };
+
+use rows::{Mark, Rows, Wanted};
 
 /// What of the records.
 #[derive(Debug, Deserialize, IntoParams)]
@@ -49,19 +54,42 @@ pub(crate) struct LiveQuery {
     /// With the controllers' states.
     #[serde(default)]
     state: bool,
+    /// How the feed is told: `records` where not given.
+    #[serde(default)]
+    form: Form,
+    /// With `form=rows`: every cycle of these loops, names separated by commas, at most 8.
+    trace: Option<String>,
+    /// With `form=rows`: the id of the last event that the reader has; the header `Last-Event-ID` does the same.
+    after: Option<String>,
+}
+
+/// How a feed is told.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize, ToSchema)]
+#[serde(rename_all = "kebab-case")]
+pub(crate) enum Form {
+    /// Every record, whole.
+    #[default]
+    Records,
+    /// The numbers of the newest cycle of each loop, a few times a second.
+    Rows,
 }
 
 /// Follows the records. Events: `record` (a record), `hosts` (the hosts, every second, the first at once), `lost` (how many
 /// records this reader was too slow for).
+///
+/// With `form=rows`, for pages that watch many loops: `rows` (LiveRows) every `every_ms` (50 to 10,000, else 200), `notices` (what
+/// people should hear of), `hosts` every second, `loops` (where each loop stands) when that changed. Every event has an id; with
+/// `Last-Event-ID` a reader gets the notices and the traced cycles that it missed. A slow reader gets the newest of each loop.
 #[utoipa::path(get, operation_id = "follow_records", path = "/v1/live", tag = "cell", params(LiveQuery),
     responses(
-        (status = 200, description = "Server-sent events: `record` with a Record, `hosts` with Hosts, `lost` with {\"records\": n}",
+        (status = 200, description = "Server-sent events: `record` with a Record, `hosts` with Hosts, `lost` with {\"records\": n}; in rows: `rows`, `notices`, `hosts`, `loops`",
             body = Record, content_type = "text/event-stream"),
         (status = "default", description = "What went wrong", body = Problem, content_type = "application/problem+json")))]
 pub(crate) async fn feed(
     State(app): State<App>,
     InQuery(query): InQuery<LiveQuery>,
-) -> Result<impl IntoResponse, Problem> {
+    headers: HeaderMap,
+) -> Result<Response, Problem> {
     let loops = query.loops.as_deref().map(loop_names).transpose()?;
     let place = Arc::clone(&app.feeds).try_acquire_owned().map_err(|_| {
         Problem::new(
@@ -70,6 +98,17 @@ pub(crate) async fn feed(
             "close one, or ask another host of the cell",
         )
     })?;
+    // Proxies such as nginx hold back what they do not know to be a feed.
+    let unbuffered = [(HeaderName::from_static("x-accel-buffering"), "no")];
+    if query.form == Form::Rows {
+        let wanted = wanted_rows(&query, loops, &headers)?;
+        let rows = Rows::open(app, wanted, place).await;
+        let events = stream::unfold(rows, async |mut rows| {
+            rows.next().await.map(|event| (Ok::<_, Infallible>(event), rows))
+        });
+        let sse = Sse::new(events).keep_alive(KeepAlive::new().interval(KEEP_ALIVE));
+        return Ok((unbuffered, sse).into_response());
+    }
     let mut hosts = tokio::time::interval(HOSTS_EVERY);
     hosts.set_missed_tick_behavior(MissedTickBehavior::Skip);
     let feed = Feed {
@@ -88,12 +127,43 @@ pub(crate) async fn feed(
     let events = stream::unfold(feed, async |mut feed| {
         feed.next().await.map(|event| (Ok::<_, Infallible>(event), feed))
     });
-    // Proxies such as nginx hold back what they do not know to be a feed.
-    let unbuffered = [(HeaderName::from_static("x-accel-buffering"), "no")];
-    Ok((
-        unbuffered,
-        Sse::new(events).keep_alive(KeepAlive::new().interval(KEEP_ALIVE)),
-    ))
+    let sse = Sse::new(events).keep_alive(KeepAlive::new().interval(KEEP_ALIVE));
+    Ok((unbuffered, sse).into_response())
+}
+
+/// What a feed in rows shall carry.
+fn wanted_rows(query: &LiveQuery, loops: Option<HashSet<LoopId>>, headers: &HeaderMap) -> Result<Wanted, Problem> {
+    let traced = query.trace.as_deref().map(loop_names).transpose()?.unwrap_or_default();
+    if traced.len() > TRACES_MAX {
+        let detail = format!("trace names {} loops", traced.len());
+        return Err(Problem::new(
+            Kind::Invalid,
+            detail,
+            format!("name at most {TRACES_MAX}"),
+        ));
+    }
+    let every_ms = query
+        .every_ms
+        .unwrap_or(BEAT_MS_DEFAULT)
+        .clamp(BEAT_MS_MIN, BEAT_MS_MAX);
+    // A browser that reconnects by itself sends the header; it is the newer one.
+    let header = headers.get("last-event-id").and_then(|value| value.to_str().ok());
+    let after = header.or(query.after.as_deref()).filter(|text| !text.is_empty());
+    let after = after
+        .map(|text| {
+            Mark::parse(text).ok_or_else(|| {
+                let text: String = text.chars().take(80).collect();
+                let detail = format!("{text:?} is no id of an event of this feed");
+                Problem::new(Kind::Invalid, detail, "leave it out to begin anew")
+            })
+        })
+        .transpose()?;
+    Ok(Wanted {
+        loops,
+        traced,
+        every: Duration::from_millis(u64::from(every_ms)),
+        after,
+    })
 }
 
 /// Names from the query.

@@ -1,11 +1,6 @@
-//! Health, metrics, the OpenAPI document, and a page that lists the addresses.
+//! Health, metrics, and the OpenAPI document.
 
-use axum::{
-    Json as JsonAnswer,
-    extract::State,
-    http::header,
-    response::{Html, IntoResponse},
-};
+use axum::{Json as JsonAnswer, extract::State, http::header, response::IntoResponse};
 use serde_json::{Value, json};
 
 use crate::{
@@ -61,11 +56,3 @@ pub(crate) async fn metrics(State(app): State<App>) -> Result<impl IntoResponse,
 pub(crate) async fn openapi() -> impl IntoResponse {
     ([(header::CONTENT_TYPE, "application/json")], openapi_json())
 }
-
-/// The addresses, for people who come with a browser.
-pub(crate) async fn index(State(app): State<App>) -> Html<String> {
-    // A host's name is letters, digits and dashes, so it needs no escaping.
-    Html(INDEX.replace("{host}", app.cell.here().as_str()))
-}
-
-const INDEX: &str = include_str!("index.html");

@@ -177,6 +177,14 @@ fn admission(verdict: bumpless_core::Verdict) -> bumpless_core::Admission {
     }
 }
 
+/// A record for tests of other rooms of this crate.
+pub(crate) fn a_record(name: &str, seq: u64) -> Record {
+    Record {
+        events: vec![],
+        ..record(name, seq)
+    }
+}
+
 fn record(name: &str, seq: u64) -> Record {
     Record {
         loop_id: loop_id(name),

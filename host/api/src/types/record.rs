@@ -42,12 +42,12 @@ impl PortTable {
     }
 
     /// A port's name, or its number where the component is not known (any more).
-    fn name(&self, port: usize) -> String {
+    pub(crate) fn name(&self, port: usize) -> String {
         self.names.get(port).cloned().unwrap_or_else(|| port.to_string())
     }
 
     /// Values of the output ports by name.
-    fn by_output(&self, values: &[f64]) -> BTreeMap<String, Option<f64>> {
+    pub(crate) fn by_output(&self, values: &[f64]) -> BTreeMap<String, Option<f64>> {
         let name = |i: usize| self.outputs.get(i).cloned().unwrap_or_else(|| i.to_string());
         values
             .iter()

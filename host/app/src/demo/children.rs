@@ -21,6 +21,9 @@ use std::{
     time::{Duration, Instant},
 };
 
+use bumpless_api::types::Fault;
+use rustix::process::{Pid, Signal, kill_process};
+
 use crate::{error::Error, host::Ready, show};
 
 /// Longest wait for a host to get ready.
@@ -38,11 +41,21 @@ pub(super) struct Plan {
     program: PathBuf,
     /// Name and API port; 0 for any.
     hosts: Vec<(String, u16)>,
+    /// Tanks beside the plant.
+    tanks: u32,
+    /// Where the children pass on the faults that they are asked for.
+    faults: mpsc::SyncSender<Fault>,
 }
 
 impl Plan {
     /// The first host serves the plant. Ports count up from `first_port` where they are free.
-    pub(super) fn new(dir: &Path, names: &[&str], first_port: u16) -> Result<Self, Error> {
+    pub(super) fn new(
+        dir: &Path,
+        names: &[&str],
+        first_port: u16,
+        tanks: u32,
+        faults: mpsc::SyncSender<Fault>,
+    ) -> Result<Self, Error> {
         let program = std::env::current_exe().map_err(|source| Error::File {
             path: "this program".into(),
             action: "found",
@@ -57,6 +70,8 @@ impl Plan {
             dir: dir.to_owned(),
             program,
             hosts,
+            tanks,
+            faults,
         })
     }
 
@@ -72,7 +87,11 @@ impl Plan {
             source,
         })?;
         let config = dir.join("host.toml");
-        fs::write(&config, host_file(name, *port, connect, index == 0)).map_err(|source| Error::File {
+        fs::write(
+            &config,
+            host_file(name, *port, connect, (index == 0).then_some(self.tanks)),
+        )
+        .map_err(|source| Error::File {
             path: config.clone(),
             action: "written",
             source,
@@ -85,7 +104,7 @@ impl Plan {
             source,
         })?;
         let mut process = process::Command::new(&self.program)
-            .args(["host", "--until-stdin-closes", "--config"])
+            .args(["host", "--until-stdin-closes", "--faults-on-stdout", "--config"])
             .arg(&config)
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
@@ -99,6 +118,7 @@ impl Plan {
                 source,
             })?;
         let (sender, ready) = mpsc::channel();
+        let faults = self.faults.clone();
         if let Some(stdout) = process.stdout.take() {
             // Ends with the child's standard output.
             let read = move || {
@@ -106,6 +126,9 @@ impl Plan {
                     if let Ok(line) = serde_json::from_str::<Ready>(&line) {
                         // Nobody waits any more where the child was given up.
                         let _ = sender.send(line);
+                    } else if let Ok(fault) = serde_json::from_str::<Fault>(&line) {
+                        // Too many at once are dropped; whoever asks sees that nothing happened.
+                        let _ = faults.try_send(fault);
                     }
                 }
             };
@@ -123,8 +146,8 @@ impl Plan {
     }
 }
 
-/// A host's configuration.
-fn host_file(name: &str, port: u16, connect: &[String], plant: bool) -> String {
+/// A host's configuration; one with a number of tanks has the plant.
+fn host_file(name: &str, port: u16, connect: &[String], tanks: Option<u32>) -> String {
     let connect: Vec<String> = connect.iter().map(|at| format!("{at:?}")).collect();
     let mut text = format!(
         "# A host of the demonstration; the next start replaces this file.\nhost = \"{name}\"\n\n\
@@ -132,8 +155,14 @@ fn host_file(name: &str, port: u16, connect: &[String], plant: bool) -> String {
          [api]\nlisten = \"127.0.0.1:{port}\"\n",
         connect.join(", ")
     );
-    if plant {
+    if tanks.is_some() {
         text.push_str("\n[[bus]]\nid = \"plant\"\ndriver = \"sim\"\nseed = 1\non_stop = \"safe\"\n");
+    }
+    if let Some(count @ 1..) = tanks {
+        text.push_str(&format!(
+            "\n[[bus]]\nid = \"tanks\"\ndriver = \"sim\"\nseed = 2\non_stop = \"safe\"\n\
+             fopdt = {{ count = {count}, gain = 0.9, tau_s = 6.0, dead_time_s = 0.4, noise = 0.15 }}\n"
+        ));
     }
     text
 }
@@ -232,6 +261,14 @@ impl Cell {
         self.children.iter().find(|child| child.name == name).map(Child::api)
     }
 
+    /// Sends a signal to a host that lives; false where there is none of that name.
+    pub(super) fn signal(&self, name: &str, signal: Signal) -> bool {
+        let child = self.children.iter().find(|child| child.name == name && !child.dead);
+        child
+            .and_then(|child| Pid::from_raw(i32::try_from(child.id()).ok()?))
+            .is_some_and(|pid| kill_process(pid, signal).is_ok())
+    }
+
     /// Who died since the last look, in words.
     pub(super) fn deaths(&mut self) -> Vec<String> {
         let mut deaths = Vec::new();
@@ -249,11 +286,12 @@ impl Cell {
         deaths
     }
 
-    /// Starts the dead again, joined to all others.
-    pub(super) fn revive(&mut self, stop: &AtomicBool) -> Vec<Result<String, Error>> {
+    /// Starts the dead again, or one of them, joined to all others.
+    pub(super) fn revive(&mut self, only: Option<&str>, stop: &AtomicBool) -> Vec<Result<String, Error>> {
         let mut ends = Vec::new();
         for index in 0..self.children.len() {
-            if !self.children[index].dead {
+            let child = &self.children[index];
+            if !child.dead || only.is_some_and(|name| name != child.name) {
                 continue;
             }
             let others = self
@@ -281,6 +319,13 @@ impl Cell {
             Some((plant, controllers)) => (plant, controllers),
             None => return,
         };
+        // One that is paused hears nothing.
+        for child in controllers.iter().chain([&*plant]).filter(|child| !child.dead) {
+            if let Some(pid) = i32::try_from(child.id()).ok().and_then(Pid::from_raw) {
+                // It may have ended by itself; then there is nothing to continue.
+                let _ = kill_process(pid, Signal::CONT);
+            }
+        }
         // All are told before one is waited for.
         for child in controllers.iter_mut() {
             drop(child.process.stdin.take());
@@ -347,9 +392,9 @@ mod tests {
     #[test]
     fn the_hosts_files_are_good_ones() {
         let at = ["tcp/127.0.0.1:1".to_owned(), "tcp/127.0.0.1:2".to_owned()];
-        let plant = Config::parse(&host_file("plant", 0, &[], true), Path::new("host.toml")).expect("a good file");
+        let plant = Config::parse(&host_file("plant", 0, &[], Some(3)), Path::new("host.toml")).expect("a good file");
         assert_eq!((plant.io, plant.control), (true, false));
-        let a = Config::parse(&host_file("a", 8481, &at, false), Path::new("host.toml")).expect("a good file");
+        let a = Config::parse(&host_file("a", 8481, &at, None), Path::new("host.toml")).expect("a good file");
         assert_eq!((a.io, a.control), (false, true));
         assert_eq!(a.cell.connect, at);
         assert_eq!(a.api_listen.port(), 8481);

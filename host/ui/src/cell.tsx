@@ -1,0 +1,303 @@
+// The cell: hosts with their load and who is how far from whom, points, events, and the faults of the demonstration.
+
+import { signal } from "@preact/signals";
+import { useEffect } from "preact/hooks";
+import { send } from "./api";
+import { ago, bytes, clock, day, duration_us, value, zone } from "./format";
+import { addresses, demo, hosts, load_points, loops, notices, points, standing_alarms } from "./live";
+import type { Host, Weight } from "./types";
+import { Act, Bar, Danger, None, say } from "./ui";
+
+/** Step times as owners saw them, by owner and by who stepped: the last ones, in µs. */
+const seen = new Map<string, number[]>();
+const SAMPLES = 200;
+let counted = 0;
+
+/** Notes the newest cycle of each loop. Called with each beat of the feed. */
+export function note_steps(): void {
+  counted += 1;
+  for (const loop of loops.peek().values()) {
+    const row = loop.row.peek();
+    if (!row) continue;
+    const key = `${row.owner} ${row.stepped_by}`;
+    let list = seen.get(key);
+    if (!list) seen.set(key, (list = []));
+    list.push(row.step_us);
+    if (list.length > SAMPLES) list.shift();
+  }
+}
+
+function median(list: number[]): number {
+  const sorted = [...list].sort((a, b) => a - b);
+  return sorted[sorted.length >> 1] ?? 0;
+}
+
+const fault = (host: string, what: string, seconds = 5) => async (): Promise<void> => {
+  await send("POST", "/v1/demo/faults", { host, fault: what, seconds });
+  say(`${what} ${what === "stress" ? "the machine" : host}: asked for`);
+};
+
+function HostCard({ host }: { host: Host }) {
+  const roles = [host.io && "I/O", host.control && "control"].filter(Boolean).join(", ");
+  const state = !host.alive ? "not alive" : host.draining ? "being emptied" : "alive";
+  return (
+    <article class={`panel host${host.alive ? "" : " grave"}`} aria-label={`Host ${host.name}`}>
+      <header class="row">
+        <h2 class="grow">
+          {host.name} {host.here && <small>(serves this page)</small>}
+        </h2>
+        <span class={host.alive ? (host.draining ? "tag warn" : "tag") : "tag urgent"}>{state}</span>
+      </header>
+      <Bar label={`load of ${host.name}`} kind="pv" at={host.alive ? host.cpu_percent : null} low={0} high={100} unit="%" />
+      <dl>
+        <dt>Role</dt>
+        <dd>{roles}</dd>
+        <dt>Load</dt>
+        <dd>
+          {host.cpu_percent.toFixed(0)} % of its cores, {host.cpu_process_cores.toFixed(2)} cores itself
+        </dd>
+        <dt>Memory</dt>
+        <dd>{bytes(host.memory_bytes)}</dd>
+        <dt>Latency</dt>
+        <dd>{host.latency_ms === null ? "–" : duration_us(host.latency_ms * 1_000)}</dd>
+        <dt>Loops</dt>
+        <dd>
+          owns {host.loops_owned}, holds {host.loops_held}
+        </dd>
+        <dt>Version</dt>
+        <dd>{host.version}</dd>
+      </dl>
+      {host.api && !host.here && (
+        <a class="small-link" href={`${host.api}/`}>
+          open its page
+        </a>
+      )}
+      {host.control && host.alive && addresses.value.has("/v1/hosts/{name}/drain") && (
+        <div class="row wrap">
+          {host.draining ? (
+            <Act class="small" label={`Take loops again, ${host.name}`} act={async () => {
+              await send("POST", `/v1/hosts/${host.name}/undrain`, {});
+              say(`${host.name} takes loops again.`, () => send("POST", `/v1/hosts/${host.name}/drain`, {}));
+            }}>
+              Take loops again
+            </Act>
+          ) : (
+            <Act class="small" label={`Drain ${host.name}`} title="Its loops move to other hosts between two cycles; new ones stay away." act={async () => {
+              const end = await send<{ loops_owned: number }>("POST", `/v1/hosts/${host.name}/drain`, {});
+              say(end.loops_owned === 0 ? `${host.name} is empty.` : `${host.name} still owns ${end.loops_owned} loops.`, () => send("POST", `/v1/hosts/${host.name}/undrain`, {}));
+            }}>
+              Drain
+            </Act>
+          )}
+        </div>
+      )}
+      {demo.value && (
+        <div class="row wrap faults" role="group" aria-label={`Faults of ${host.name}`}>
+          {host.alive ? (
+            <>
+              {host.io ? (
+                <Danger label="Kill" title={`Kill ${host.name}?`} text="It serves the points: its loops stand still until it is back." name={host.name} act={fault(host.name, "kill")} />
+              ) : (
+                <Act class="small" label={`Kill ${host.name}`} act={fault(host.name, "kill")}>
+                  Kill
+                </Act>
+              )}
+              <Act class="small" label={`Pause 5 s, ${host.name}`} act={fault(host.name, "pause")}>
+                Pause 5 s
+              </Act>
+              <Act class="small" label={`Stress 5 s, the machine of ${host.name}`} act={fault(host.name, "stress")}>
+                Stress 5 s
+              </Act>
+            </>
+          ) : (
+            <Act class="small" label={`Start again ${host.name}`} act={fault(host.name, "start")}>
+              Start again
+            </Act>
+          )}
+        </div>
+      )}
+    </article>
+  );
+}
+
+export function Hosts() {
+  counted;
+  const all = hosts.value;
+  const owners = all.filter((host) => all.some((other) => seen.has(`${host.name} ${other.name}`)));
+  return (
+    <>
+      <div class="head">
+        <h1>Hosts</h1>
+        <p class="quiet">
+          {all.filter((host) => host.alive).length} of {all.length} alive
+        </p>
+        {demo.value && <p class="tag">demonstration: faults are for you to make</p>}
+      </div>
+      <div class="cards hosts">
+        {all.map((host) => (
+          <HostCard key={host.name} host={host} />
+        ))}
+      </div>
+      <section class="panel" aria-label="Latency of steps">
+        <h2>Steps between hosts</h2>
+        <p class="hint">Median time of a step as its owner saw it, network included, over the last {SAMPLES} cycles that this page saw of each pair.</p>
+        {owners.length === 0 ? (
+          <None what="No cycles seen yet." />
+        ) : (
+          <div class="scroll">
+            <table class="matrix">
+              <thead>
+                <tr>
+                  <th scope="col">owner ↓ stepped by →</th>
+                  {all.map((host) => (
+                    <th key={host.name} scope="col">
+                      {host.name}
+                    </th>
+                  ))}
+                </tr>
+              </thead>
+              <tbody>
+                {owners.map((owner) => (
+                  <tr key={owner.name}>
+                    <th scope="row">{owner.name}</th>
+                    {all.map((by) => {
+                      const list = seen.get(`${owner.name} ${by.name}`);
+                      return <td key={by.name}>{list ? duration_us(median(list)) : "–"}</td>;
+                    })}
+                  </tr>
+                ))}
+              </tbody>
+            </table>
+          </div>
+        )}
+      </section>
+    </>
+  );
+}
+
+const point_filter = signal("");
+
+export function Points() {
+  useEffect(() => {
+    void load_points();
+    const every = setInterval(() => void load_points(), 1_000);
+    return () => clearInterval(every);
+  }, []);
+  const wanted = point_filter.value.trim().toLowerCase();
+  const shown = [...points.value.values()].filter((point) => `${point.name} ${point.text} ${point.written_by ?? ""}`.toLowerCase().includes(wanted));
+  return (
+    <>
+      <div class="head">
+        <h1>Points</h1>
+        <p class="quiet">{points.value.size} points</p>
+        <div class="row end grow">
+          <input type="search" class="short" placeholder="filter" aria-label="Filter points" value={point_filter.value} onInput={(event) => (point_filter.value = event.currentTarget.value)} />
+        </div>
+      </div>
+      <div class="scroll" tabIndex={0} role="region" aria-label="Table of points">
+        <table class="list">
+          <thead>
+            <tr>
+              <th>Point</th>
+              <th class="num">Value</th>
+              <th>Unit</th>
+              <th>In range</th>
+              <th>Quality</th>
+              <th class="num">Age</th>
+              <th>Written by</th>
+              <th>Host, bus</th>
+            </tr>
+          </thead>
+          <tbody>
+            {shown.map((point) => (
+              <tr key={point.name}>
+                <th scope="row">
+                  {point.name}
+                  <br />
+                  <small>{point.text}</small>
+                </th>
+                <td class="num">{value(point.value, point.range[1] - point.range[0])}</td>
+                <td>{point.unit}</td>
+                <td class="barcell">
+                  <Bar label={point.name} kind={point.writable ? "out" : "pv"} at={point.value} low={point.range[0]} high={point.range[1]} unit={point.unit} />
+                </td>
+                <td class={point.quality === "bad" ? "urgent-text" : point.quality === "uncertain" ? "warn-text" : ""} title={point.reason}>
+                  {point.quality}
+                  {point.reason && <small> {point.reason}</small>}
+                </td>
+                <td class="num">{point.age_ms > 86_400_000 ? "–" : duration_us(point.age_ms * 1_000)}</td>
+                <td>{point.written_by ? <a href={`#/loop/${point.written_by}`}>{point.written_by}</a> : ""}</td>
+                <td>
+                  {point.host}, {point.bus}
+                </td>
+              </tr>
+            ))}
+          </tbody>
+        </table>
+      </div>
+      {shown.length === 0 && <None what="No points." />}
+    </>
+  );
+}
+
+const least = signal<Weight>("info");
+const event_filter = signal("");
+const ORDER: Weight[] = ["info", "warning", "urgent"];
+
+export function Events() {
+  const wanted = event_filter.value.trim().toLowerCase();
+  const shown = notices.value
+    .filter((notice) => ORDER.indexOf(notice.weight) >= ORDER.indexOf(least.value) && `${notice.loop} ${notice.text}`.toLowerCase().includes(wanted))
+    .slice(-300)
+    .reverse();
+  return (
+    <>
+      <div class="head">
+        <h1>Events</h1>
+        <p class="quiet">times in {zone()}</p>
+        <div class="row end grow">
+          <label class="field inline">
+            <span>from</span>
+            <select value={least.value} onChange={(event) => (least.value = event.currentTarget.value as Weight)}>
+              {ORDER.map((weight) => (
+                <option key={weight}>{weight}</option>
+              ))}
+            </select>
+          </label>
+          <input type="search" class="short" placeholder="filter" aria-label="Filter events" value={event_filter.value} onInput={(event) => (event_filter.value = event.currentTarget.value)} />
+        </div>
+      </div>
+      {standing_alarms.value.length > 0 && (
+        <section class="panel grave" aria-label="Alarms that are raised">
+          <h2>Raised now</h2>
+          <ol class="events">
+            {standing_alarms.value.map((alarm) => (
+              <li key={alarm.number} class={alarm.weight}>
+                <time>{clock(alarm.at_unix_us / 1_000)}</time>
+                <a href={`#/loop/${alarm.loop}`}>{alarm.loop}</a>
+                <span>{alarm.text}</span>
+                <small>{ago(alarm.at_unix_us / 1_000)}</small>
+              </li>
+            ))}
+          </ol>
+        </section>
+      )}
+      <section class="panel" aria-label="All events">
+        <ol class="events long">
+          {shown.map((notice) => (
+            <li key={notice.number} class={notice.weight}>
+              <time title={day(notice.at_unix_us / 1_000)}>{clock(notice.at_unix_us / 1_000)}</time>
+              <a href={`#/loop/${notice.loop}`}>{notice.loop}</a>
+              <span>
+                <b class="weight">{notice.weight === "info" ? "" : `${notice.weight}: `}</b>
+                {notice.text}
+              </span>
+              <small>cycle {notice.seq}</small>
+            </li>
+          ))}
+        </ol>
+        {shown.length === 0 && <None what="Nothing to tell." />}
+      </section>
+    </>
+  );
+}
