@@ -22,6 +22,8 @@ pub(crate) struct Felt {
     pub(crate) lost_raw: u64,
     /// Those of them that the machine's stalls do not explain.
     pub(crate) lost: u64,
+    /// Pauses of one and a half periods and more without a cycle lost, less the machine's stalls.
+    pub(crate) late: u64,
     /// Longest pause between two writes, in periods.
     pub(crate) gap_raw: f64,
     /// The same without the machine's stalls.
@@ -56,6 +58,9 @@ pub(crate) fn felt(
             felt.gap = periods(own_ns);
             felt.worst_ns = (gap.from_ns, gap.to_ns);
         }
+        if gap.cycles_missing == 0 && periods(own_ns) >= 1.5 {
+            felt.late += 1;
+        }
         felt.lost_raw += gap.cycles_missing;
         if stalled_ns < gap.cycles_missing * (period_ns / 2) {
             felt.lost += gap.cycles_missing;
@@ -70,6 +75,7 @@ impl Felt {
         self.writes += other.writes;
         self.lost_raw += other.lost_raw;
         self.lost += other.lost;
+        self.late += other.late;
         self.gap_raw = self.gap_raw.max(other.gap_raw);
         if other.gap > self.gap {
             self.gap = other.gap;
@@ -144,6 +150,7 @@ mod tests {
                 writes: 5,
                 lost_raw: 1,
                 lost: 1,
+                late: 1,
                 gap_raw: 2.0,
                 gap: 2.0,
                 worst_ns: (200, 400)
@@ -164,6 +171,7 @@ mod tests {
                 writes: 5,
                 lost_raw: 1,
                 lost: 0,
+                late: 0,
                 gap_raw: 2.0,
                 gap: 1.0,
                 worst_ns: (100, 200)

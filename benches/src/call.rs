@@ -205,6 +205,8 @@ fn vitals(host: HostId, ready: Digest) -> Vitals {
         loops_owned: 0,
         loops_held: 0,
         draining: false,
+        drain_kept: false,
+        labels: vec![],
         version: String::new(),
     }
 }

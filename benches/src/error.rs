@@ -44,6 +44,12 @@ pub(crate) enum Error {
     /// A loop's specification does not fit its component.
     #[error("the loop does not fit the component")]
     Spec(#[from] bumpless_core::spec::SpecError),
+    /// A wish that cannot be fulfilled.
+    #[error("{0}")]
+    Wish(String),
+    /// A picture.
+    #[error("the picture could not be drawn: {0}")]
+    Picture(String),
     /// Too few cores.
     #[error("this process may use {0} cores; the bench needs 2, to load one and leave the others alone")]
     Cores(usize),

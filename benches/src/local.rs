@@ -235,6 +235,7 @@ fn spec(number: u32, period_ns: u64, digest: bumpless_core::Digest) -> Result<Lo
         listens: Vec::new(),
         fallback: None,
         fallback_parameters: BTreeMap::new(),
+        prefer: vec![],
         policy: Policy::default(),
     })
 }

@@ -6,6 +6,8 @@
 
 mod actuator;
 mod call;
+mod chaos;
+mod chaos_report;
 mod conditions;
 mod delay;
 mod error;
@@ -13,10 +15,12 @@ mod failover;
 mod faults;
 mod history;
 mod lab;
+mod kills;
 mod law;
 mod local;
 mod page;
 mod peer;
+mod redundancy;
 mod report;
 mod rest;
 mod select;
@@ -51,6 +55,14 @@ enum Bench {
         /// Only this kind of fault.
         #[arg(long, value_enum)]
         only: Option<FaultKind>,
+    },
+    /// Faults of every kind on a cell of five hosts and twenty loops, by a seed, under a checker.
+    Chaos(chaos::Wishes),
+    /// Replicas off and on while a loop steps, as a picture, and its error against an undisturbed run.
+    Redundancy {
+        /// Where the picture goes.
+        #[arg(long, default_value = "docs/figures/redundancy.svg")]
+        svg: std::path::PathBuf,
     },
     /// A remote step over loopback TCP between processes, on the bus and through the REST API.
     Call,
@@ -127,6 +139,8 @@ fn main() -> ExitCode {
 fn run(bench: &Bench, options: Options) -> Result<bool, Error> {
     let name = match bench {
         Bench::Call => "call",
+        Bench::Chaos(_) => "chaos",
+        Bench::Redundancy { .. } => "redundancy",
         Bench::Failover { .. } => "failover",
         Bench::Select => "select",
         Bench::Swap(_) => "swap",
@@ -141,6 +155,9 @@ fn run(bench: &Bench, options: Options) -> Result<bool, Error> {
     let mut report = Report::begin(&conditions, options.json);
     match bench {
         Bench::Call => call::run(options, &mut report)?,
+        Bench::Chaos(wishes) if wishes.owner_kills() => kills::run(options, &mut report)?,
+        Bench::Chaos(wishes) => chaos::run(options, wishes, &mut report)?,
+        Bench::Redundancy { svg } => redundancy::run(options, svg, &mut report)?,
         Bench::Failover { only } => failover::run(options, *only, &mut report)?,
         Bench::Select => select::run(options, &mut report)?,
         Bench::Swap(switching) if switching.is_wanted() => switch::run(options, *switching, &mut report)?,

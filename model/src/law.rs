@@ -71,6 +71,7 @@ pub(crate) fn law(revision: u64) -> Law {
         listens: Vec::new(),
         fallback: None,
         fallback_parameters: Default::default(),
+        prefer: vec![],
         policy: Policy::default(),
     };
     let wiring = Wiring::new(&spec, &descriptor).expect("the law fits its loop");

@@ -5,7 +5,9 @@
 //! | story | a loop's whole life: swaps, commands, the death of its owner |
 //! | restarts | the whole cell, or the I/O host alone, dies and comes back |
 //! | changes | what may change while a loop runs, what brings it back, and owners that die meanwhile |
-//! | members | frozen owners, late hosts, draining |
+//! | members | frozen owners, late hosts, hosts that leave |
+//! | drain | hosts that are emptied, restarted one by one, preferred, cut off |
+//! | chaos | faults by a seed, under the checker |
 //! | history | replays, backtests, shadows |
 //! | rollouts | one component for many loops, one loop first |
 //! | calls | the cell as a control service |
@@ -30,6 +32,8 @@
 mod alarms;
 mod calls;
 mod changes;
+mod chaos;
+mod drain;
 mod guides;
 mod history;
 mod house;

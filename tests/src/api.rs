@@ -55,12 +55,18 @@ impl Api {
     /// The API at an address such as `http://127.0.0.1:8480`.
     #[must_use]
     pub fn new(base: impl Into<String>) -> Self {
+        Self::within(base, REQUEST_MAX)
+    }
+
+    /// The same, with another longest time for a request.
+    #[must_use]
+    pub fn within(base: impl Into<String>, longest: Duration) -> Self {
         let agent = ureq::Agent::config_builder()
             .http_status_as_error(false)
             // The hosts are on this machine; proxies are for the world outside.
             .proxy(None)
             .timeout_connect(Some(Duration::from_secs(5)))
-            .timeout_global(Some(REQUEST_MAX))
+            .timeout_global(Some(longest))
             .build()
             .into();
         Self {

@@ -1,11 +1,11 @@
 //! A cell on this machine: one host with the simulated plant, and controller hosts `a`, `b`, `c`…
 
-use std::{path::Path, time::Duration};
+use std::{collections::BTreeMap, net::SocketAddr, path::Path, sync::Arc, time::Duration};
 
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-use crate::{Api, Error, HostOptions, HostProcess, Journal, slots::Slot, wait_until};
+use crate::{Api, Disk, Error, HostOptions, HostProcess, Journal, Net, Relay, slots::Slot, wait_until};
 
 /// Name of the host with the plant.
 pub const PLANT: &str = "plant";
@@ -34,6 +34,14 @@ pub struct CellOptions {
     pub cell_extra: String,
     /// Words before the command of a host, by host name.
     pub launchers: Vec<(String, Vec<String>)>,
+    /// Keys before the tables of a host's configuration, as TOML lines, by host name.
+    pub heads: Vec<(String, String)>,
+    /// Namespaces to run in, the plant in the first; on the loopback interface where there are none.
+    pub net: Option<Arc<Net>>,
+    /// Hosts whose data lies on a small disk of their own, with its bytes.
+    pub disks: Vec<(String, u64)>,
+    /// The controller host whose link with the plant passes a relay.
+    pub relayed: Option<String>,
 }
 
 impl Default for CellOptions {
@@ -47,6 +55,10 @@ impl Default for CellOptions {
             host_tables: Vec::new(),
             cell_extra: String::new(),
             launchers: Vec::new(),
+            heads: Vec::new(),
+            net: None,
+            disks: Vec::new(),
+            relayed: None,
         }
     }
 }
@@ -80,6 +92,10 @@ pub struct Cell {
     pub controllers: Vec<HostProcess>,
     /// The cell's name.
     pub name: String,
+    /// The link between the plant and [`CellOptions::relayed`].
+    pub relay: Option<Relay>,
+    /// Small disks, by host.
+    pub disks: BTreeMap<String, Disk>,
     options: CellOptions,
     // After the hosts, so that it is removed when nobody writes into it any more.
     folder: TempDir,
@@ -103,23 +119,35 @@ impl Cell {
                 source,
             })?;
         let name = format!("test-{:016x}", random());
+        let mut disks = BTreeMap::new();
+        for (host, bytes) in &options.disks {
+            let data = folder.path().join(host).join("data");
+            disks.insert(host.clone(), Disk::mount(&data, *bytes)?);
+        }
         let plant_options = HostOptions {
-            name: PLANT.to_owned(),
-            cell: name.clone(),
             tables: format!("{}\n{}", options.bus, options.plant_tables),
-            cell_extra: options.cell_extra.clone(),
-            launcher: launcher(&options, PLANT),
-            ..HostOptions::default()
+            ..host_options(&options, &name, PLANT)
         };
         let plant = HostProcess::start(plant_options, &folder.path().join(PLANT))?;
+        let relay = options
+            .relayed
+            .as_ref()
+            .map(|_| relay_to(&plant, options.net.as_deref()));
         let mut cell = Self {
             plant,
             controllers: Vec::new(),
             name,
+            relay: relay.transpose()?,
+            disks,
             options,
             folder,
             _slot: slot,
         };
+        if let (Some(net), Some(number)) = (&cell.options.net, cell.options.relayed.as_deref().map(host_number)) {
+            // Only the relay leads from one to the other.
+            net.cut(0, number)?;
+            net.cut(number, 0)?;
+        }
         for n in 0..cell.options.controllers {
             let host = cell.spawn_controller(&controller_name(n))?;
             cell.controllers.push(host);
@@ -135,13 +163,9 @@ impl Cell {
         let own = self.options.host_tables.iter().find(|(host, _)| host == name);
         let own = own.map(|(_, tables)| tables.as_str()).unwrap_or_default();
         let options = HostOptions {
-            name: name.to_owned(),
-            cell: self.name.clone(),
             connect: self.locators(name),
             tables: format!("{}\n{own}", self.options.controller_tables),
-            cell_extra: self.options.cell_extra.clone(),
-            launcher: launcher(&self.options, name),
-            ..HostOptions::default()
+            ..host_options(&self.options, &self.name, name)
         };
         HostProcess::spawn(options, &self.folder.path().join(name))
     }
@@ -157,12 +181,33 @@ impl Cell {
         self.wait_joined()
     }
 
-    /// Where the hosts other than `but` listen.
+    /// Where the hosts other than `but` listen, as that host may know them: of a relayed pair one knows the relay, and the
+    /// other nothing.
     fn locators(&self, but: &str) -> Vec<String> {
-        self.hosts()
-            .filter(|host| host.name != but)
-            .flat_map(|host| host.cell.iter().cloned())
-            .collect()
+        let relayed = self.options.relayed.as_deref();
+        let mut known = Vec::new();
+        for host in self.hosts().filter(|host| host.name != but) {
+            match &self.relay {
+                Some(relay) if relayed == Some(but) && host.name == PLANT => {
+                    known.push(format!("tcp/{}", relay.address))
+                }
+                Some(_) if but == PLANT && relayed == Some(host.name.as_str()) => {}
+                _ => known.extend(host.cell.iter().cloned()),
+            }
+        }
+        known
+    }
+
+    /// The namespaces that the hosts run in.
+    #[must_use]
+    pub const fn net(&self) -> Option<&Arc<Net>> {
+        self.options.net.as_ref()
+    }
+
+    /// The controller host behind the relay.
+    #[must_use]
+    pub fn relayed(&self) -> Option<&str> {
+        self.options.relayed.as_deref()
     }
 
     /// All hosts, the plant first.
@@ -254,6 +299,43 @@ impl Cell {
     pub fn folder(&self) -> &Path {
         self.folder.path()
     }
+}
+
+/// What all hosts have in common.
+fn host_options(options: &CellOptions, cell: &str, name: &str) -> HostOptions {
+    let number = host_number(name);
+    let head = options.heads.iter().find(|(host, _)| host == name);
+    let mut common = HostOptions {
+        name: name.to_owned(),
+        cell: cell.to_owned(),
+        cell_extra: options.cell_extra.clone(),
+        launcher: launcher(options, name),
+        head: head.map(|(_, keys)| keys.clone()).unwrap_or_default(),
+        ..HostOptions::default()
+    };
+    if let Some(net) = &options.net {
+        let address = net.address(number);
+        common.listen = vec![format!("tcp/{address}:0")];
+        common.api_listen = format!("{address}:0");
+        common.launcher = net.launcher(number).into_iter().chain(common.launcher).collect();
+    }
+    common
+}
+
+/// Place of a host in a net: the plant first, then the controllers by their letters.
+#[must_use]
+pub fn host_number(name: &str) -> usize {
+    let letter = ('a'..='z').position(|letter| name.len() == 1 && name.starts_with(letter));
+    letter.map_or(0, |place| place + 1)
+}
+
+fn relay_to(plant: &HostProcess, net: Option<&Net>) -> Result<Relay, Error> {
+    let locator = plant.cell.first().map(String::as_str).unwrap_or_default();
+    let address: Result<SocketAddr, _> = locator.trim_start_matches("tcp/").parse();
+    let address =
+        address.map_err(|_| Error::NoHost(format!("the plant listens at {locator:?}, which is no address")))?;
+    let on = net.map_or(std::net::Ipv4Addr::LOCALHOST, Net::own_address);
+    Relay::start(on.into(), address)
 }
 
 fn launcher(options: &CellOptions, name: &str) -> Vec<String> {

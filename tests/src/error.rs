@@ -21,7 +21,7 @@ pub enum Error {
     File {
         /// Which.
         path: PathBuf,
-        /// "read" or "written".
+        /// "read", "written" or "removed".
         action: &'static str,
         /// What the system says.
         source: io::Error,

@@ -52,6 +52,10 @@ pub struct HostOptions {
     pub launcher: Vec<String>,
     /// Environment variables besides.
     pub environment: Vec<(String, String)>,
+    /// Where its API listens, as `address:port`; a free port of the loopback interface where empty.
+    pub api_listen: String,
+    /// Keys before the tables, as TOML lines.
+    pub head: String,
 }
 
 /// What a host says on its first line.
@@ -220,12 +224,17 @@ impl HostProcess {
             .into_iter()
             .find(|list| !list.is_empty())
             .map_or_else(|| quoted(&["tcp/127.0.0.1:0".to_owned()]), |list| quoted(list));
-        let api = self.api.strip_prefix("http://").unwrap_or("127.0.0.1:0");
+        let api = match (self.api.strip_prefix("http://"), o.api_listen.as_str()) {
+            (Some(before), _) => before,
+            (None, "") => "127.0.0.1:0",
+            (None, wanted) => wanted,
+        };
         let folder = self.folder.display().to_string();
         format!(
-            "host = {:?}\ndata = {:?}\n\n[cell]\nname = {:?}\nlisten = {listen}\nconnect = {}\n{}\n\n[api]\nlisten = {api:?}\n\n{}\n",
+            "host = {:?}\ndata = {:?}\n{}\n\n[cell]\nname = {:?}\nlisten = {listen}\nconnect = {}\n{}\n\n[api]\nlisten = {api:?}\n\n{}\n",
             o.name,
             self.data().display().to_string(),
+            o.head,
             o.cell,
             quoted(&o.connect),
             o.cell_extra,
@@ -236,6 +245,11 @@ impl HostProcess {
     /// Locators to connect to from the next start on.
     pub fn set_connect(&mut self, connect: Vec<String>) {
         self.options.connect = connect;
+    }
+
+    /// Keys before the tables of its configuration, from the next start on.
+    pub fn set_head(&mut self, head: String) {
+        self.options.head = head;
     }
 
     /// Its client.

@@ -137,6 +137,32 @@ impl Journal {
         Ok(())
     }
 
+    /// The log of one point alone.
+    #[must_use]
+    pub fn only(&self, point: &str) -> Self {
+        let life_of = |n: usize| self.lives.partition_point(|&first| first <= n);
+        let (mut only, mut life) = (Self::default(), 0);
+        for (n, write) in self.writes.iter().enumerate().filter(|(_, write)| write.point == point) {
+            if life_of(n) != life {
+                life = life_of(n);
+                only.lives.push(only.writes.len());
+            }
+            only.writes.push(write.clone());
+        }
+        only
+    }
+
+    /// Brings the times of hosts whose date was moved by whole days back to those of `near_ns` and the day after it.
+    pub fn undo_dates(&mut self, near_ns: u64) {
+        for write in self
+            .writes
+            .iter_mut()
+            .chain(self.refused.iter_mut().map(|(write, _)| write))
+        {
+            write.at_ns = same_day(write.at_ns, near_ns);
+        }
+    }
+
     /// Writes to a point, in order, without those of a stopping host.
     pub fn of<'a>(&'a self, point: &'a str) -> impl Iterator<Item = &'a Write> + Clone {
         self.writes
@@ -212,6 +238,13 @@ impl Journal {
     pub fn between<'a>(&'a self, point: &'a str, from_ns: u64, to_ns: u64) -> Vec<&'a Write> {
         self.of(point).filter(|w| (from_ns..to_ns).contains(&w.at_ns)).collect()
     }
+}
+
+/// The time that differs by whole days and lies within the day after `near_ns`.
+pub(crate) fn same_day(at_ns: u64, near_ns: u64) -> u64 {
+    const DAY_NS: u64 = 86_400_000_000_000;
+    let after_ns = (i128::from(at_ns) - i128::from(near_ns)).rem_euclid(i128::from(DAY_NS));
+    near_ns.saturating_add(u64::try_from(after_ns).unwrap_or(0))
 }
 
 /// One line's write and what stands after it.
@@ -309,6 +342,16 @@ mod tests {
     }
 
     #[test]
+    fn dates_that_were_moved_are_moved_back() {
+        let day = 86_400_000_000_000_u64;
+        let start = 20_000 * day + 5;
+        for days in [-300_i64, -1, 0, 1, 17] {
+            let moved = (start + 1_000).saturating_add_signed(days * 86_400_000_000_000);
+            assert_eq!(same_day(moved, start), start + 1_000, "{days} days");
+        }
+    }
+
+    #[test]
     fn files_of_several_starts_are_one_log() {
         let folder = tempfile::tempdir().unwrap();
         // A restart may repeat a cycle, with a new term.
@@ -323,5 +366,8 @@ mod tests {
         let found = journal.check_one_writer();
         assert_eq!(found.len(), 1, "{found:?}");
         assert_eq!(found[0].kind, "a write of an ownership of before the restart");
+        let only = journal.only("p");
+        assert_eq!(only.check_one_writer(), found);
+        assert_eq!(journal.only("q").of("p").count(), 0);
     }
 }

@@ -12,6 +12,7 @@
 mod api;
 mod binary;
 mod cell;
+mod chaos;
 mod error;
 mod feed;
 mod host;
@@ -24,7 +25,11 @@ use std::path::PathBuf;
 
 pub use api::{Answer, Api};
 pub use binary::Binary;
-pub use cell::{Cell, CellOptions, PLANT, first_order_loop, pressure_loop};
+pub use cell::{Cell, CellOptions, PLANT, first_order_loop, host_number, pressure_loop};
+pub use chaos::{
+    Breach, Disk, Fault, Inflictor, Kind, Net, Observer, Operator, Order, Outcome, Profile, Relay, Schedule, Seen, Way,
+    Window, kept_commands, unix_ns,
+};
 pub use error::Error;
 pub use feed::{Event, Feed};
 pub use host::{HostOptions, HostProcess};

@@ -6,8 +6,8 @@ use std::{future::Future, pin::Pin, sync::Arc};
 
 use bumpless_core::{CommandBody, CommandId, ComponentInfo, Digest, HostId, LoopId, Record};
 use bumpless_deploy::{
-    ApplyEnd, Call, CallEnd, Change, CommandEnd, ComponentView, Counters, Deploy, Error, HostView, Imported, LoopDraft,
-    LoopView, PointView, Relabel, StageView, Upload,
+    ApplyEnd, Call, CallEnd, Change, CommandEnd, ComponentView, Counters, Deploy, DrainEnd, DrainOrder, Error,
+    HostView, Imported, LoopDraft, LoopView, PointView, Relabel, StageView, Upload,
 };
 use bumpless_deploy::{
     Window,
@@ -56,6 +56,7 @@ pub(crate) trait Cell: Send + Sync + 'static {
     fn alarm_past(&self, max: u32) -> Answer<Vec<AlarmEvent>>;
     fn act_on_alarm(&self, id: LoopId, alarm: String, act: AlarmAct, by: String) -> Answer<Option<AlarmView>>;
     fn hosts(&self) -> Vec<HostView>;
+    fn drain(&self, host: HostId, order: DrainOrder) -> Answer<DrainEnd>;
     fn here(&self) -> HostId;
     fn points(&self) -> Answer<Vec<PointView>>;
     fn call(&self, call: Call) -> Answer<CallEnd>;
@@ -227,6 +228,11 @@ impl Cell for Deploy {
 
     fn hosts(&self) -> Vec<HostView> {
         self.hosts()
+    }
+
+    fn drain(&self, host: HostId, order: DrainOrder) -> Answer<DrainEnd> {
+        let deploy = self.clone();
+        Box::pin(async move { deploy.drain(&host, order).await })
     }
 
     fn here(&self) -> HostId {

@@ -24,7 +24,7 @@ use crate::{
         history::start_shadow, history::shadows, history::show_shadow, history::stop_shadow,
         rollouts::start, rollouts::list, rollouts::show, rollouts::stop,
         alarms::list, alarms::past, alarms::act, alarms::define, alarms::remove,
-        hosts::list, hosts::points, live::feed, trend::trend, trend::list_notices, demo::show, demo::fault,
+        hosts::list, hosts::drain, hosts::undrain, hosts::points, live::feed, trend::trend, trend::list_notices, demo::show, demo::fault,
         pages::healthz, pages::readyz, pages::metrics, pages::openapi,
     ),
     components(schemas(Problem, types::Record, types::Hosts, types::LiveRows, types::Standing)),

@@ -68,6 +68,8 @@ pub(crate) fn all() -> Router<App> {
             post(alarms::act).put(alarms::define).delete(alarms::remove),
         )
         .route("/v1/hosts", get(hosts::list))
+        .route("/v1/hosts/{name}/drain", post(hosts::drain))
+        .route("/v1/hosts/{name}/undrain", post(hosts::undrain))
         .route("/v1/points", get(hosts::points))
         .route("/v1/live", get(live::feed))
         .route("/v1/loops/{name}/trend", get(trend::trend))

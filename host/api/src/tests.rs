@@ -7,6 +7,7 @@ mod alarms;
 mod candidates;
 pub(crate) mod fake;
 mod history;
+mod hosts;
 mod library;
 mod page;
 mod rollouts;

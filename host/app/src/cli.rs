@@ -8,12 +8,14 @@ use clap::{CommandFactory as _, Parser, Subcommand, ValueEnum};
 use clap_complete::Shell;
 
 mod alarm;
+mod cell;
 mod history;
 mod lab;
 mod library;
 mod rollout;
 
 pub(crate) use alarm::{AlarmCommand, Of as AlarmOf};
+pub(crate) use cell::HostsCommand;
 pub(crate) use history::HistoryCommand;
 pub(crate) use lab::{LabArgs, LabCommand, LabRunArgs};
 pub(crate) use library::{ComponentsArgs, ComponentsCommand, FilterArgs, UploadArgs};
@@ -78,8 +80,11 @@ pub(crate) enum Command {
     Lab(LabArgs),
     /// Run one step of a component somewhere in the cell.
     Call(CallArgs),
-    /// List the hosts of the cell.
-    Hosts,
+    /// The hosts of the cell: list, drain, undrain.
+    Hosts {
+        #[command(subcommand)]
+        what: Option<HostsCommand>,
+    },
     /// List the points with their values.
     Points,
     /// Follow a loop: trend, who stepped, control indices.
@@ -331,7 +336,7 @@ pub fn run(cli: Cli) -> Result<(), Error> {
         Command::Alarm { what } => commands::alarms::run(&client()?, json, what.unwrap_or(AlarmCommand::standing())),
         Command::Lab(LabArgs { what }) => commands::lab::run(client, json, what),
         Command::Call(args) => commands::components::call(&client()?, json, args),
-        Command::Hosts => commands::hosts::list(&client()?, json),
+        Command::Hosts { what } => commands::hosts::run(&client()?, json, what.unwrap_or(HostsCommand::List)),
         Command::Points => commands::hosts::points(&client()?, json),
         Command::Watch(args) => watch::run(&client()?, json, &args),
         Command::Completions { shell } => {
@@ -408,6 +413,9 @@ mod tests {
             "bumpless lab promote a.toml pressure --by itae --cycles 100 --wait",
             "bumpless call pid --input pv=1 --input ff=-2 --strategy latency",
             "bumpless watch pressure --plain --cycles 5",
+            "bumpless hosts --json",
+            "bumpless hosts drain a --keep",
+            "bumpless hosts undrain a --wait 30",
             "bumpless demo --for 5 --restart",
             "bumpless completions bash",
             "bumpless compile-child in out",

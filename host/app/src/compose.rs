@@ -98,7 +98,7 @@ impl Outlets {
 /// # Errors
 /// The first room that does not start, with its own words; what was started before it ends with its last handle.
 pub async fn run(config: Config, faults: Option<mpsc::Sender<Fault>>) -> Result<Running, Error> {
-    let clock = Clock::start();
+    let clock = Clock::start_off_by(config.clock_offset_s);
     let data = config.data.clone();
     let store = blocking(move || Store::open(&data))
         .await?
@@ -196,6 +196,7 @@ pub async fn run(config: Config, faults: Option<mpsc::Sender<Fault>>) -> Result<
             control: config.control,
         },
         api: Some(format!("http://{api}")),
+        labels: config.labels.clone(),
         version: env!("CARGO_PKG_VERSION").to_owned(),
     })
     .map_err(|e| Error::start("deployment", e))?;

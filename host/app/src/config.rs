@@ -3,6 +3,7 @@
 //! ```toml
 //! host = "a"                       # this host's name, unique in the cell
 //! data = "data"                    # components, last records, keys; beside this file
+//! labels = ["east"]                # words that loops may prefer it by, besides its name
 //! realtime = "auto"                # or "required", "off": the cycle's threads go before other work
 //!
 //! [cell]
@@ -32,7 +33,7 @@ use std::{
     time::Duration,
 };
 
-use bumpless_core::{CellName, HostId};
+use bumpless_core::{CellName, HostId, limits::HOST_LABELS_MAX};
 use bumpless_io::BusConfig;
 use serde::{Deserialize, Serialize};
 
@@ -44,6 +45,9 @@ use testing::TestingTable;
 /// Bytes of a configuration file: thousands of points fit; a mistaken path to a large file does not.
 const FILE_BYTES_MAX: u64 = 16 * 1024 * 1024;
 
+/// Furthest that a drill moves the date, in s: a year.
+const CLOCK_OFFSET_S_MAX: u64 = 366 * 86_400;
+
 /// Everything that a host is told, checked as far as text can be.
 #[derive(Debug, Clone)]
 pub struct Config {
@@ -53,6 +57,10 @@ pub struct Config {
     pub host: HostId,
     /// Folder of everything that outlives the process.
     pub data: PathBuf,
+    /// Words that it goes by besides its name, for what loops prefer.
+    pub labels: Vec<String>,
+    /// How far its date is off, in s; for drills.
+    pub clock_offset_s: i64,
     /// May the cycle's threads go before other work of the machine?
     pub realtime: Realtime,
     /// The bus between hosts.
@@ -80,6 +88,11 @@ pub(crate) struct File {
     host: HostId,
     #[serde(default = "data_default")]
     data: PathBuf,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    labels: Vec<String>,
+    /// For drills: the host believes that its date is so far off. Nothing but what people read may change by it.
+    #[serde(default)]
+    clock_offset_s: i64,
     #[serde(default)]
     realtime: Realtime,
     cell: CellTable,
@@ -255,6 +268,22 @@ impl File {
         }
         cell.check().map_err(|error| wrong("cell", error.to_string()))?;
 
+        if self.labels.len() > HOST_LABELS_MAX {
+            return Err(wrong("labels", format!("a host has at most {HOST_LABELS_MAX} labels")));
+        }
+        if let Some(bad) = self.labels.iter().find(|label| HostId::new(label).is_err()) {
+            let reason = format!("{bad:?} is no label; use lower-case letters, digits, '-', '_' and '.'");
+            return Err(wrong("labels", reason));
+        }
+        if self.clock_offset_s.unsigned_abs() > CLOCK_OFFSET_S_MAX {
+            return Err(wrong(
+                "clock_offset_s",
+                format!(
+                    "{} is more than {CLOCK_OFFSET_S_MAX} s, a year, either way",
+                    self.clock_offset_s
+                ),
+            ));
+        }
         let mut ids = std::collections::HashSet::new();
         if let Some(twice) = self.bus.iter().find(|bus| !ids.insert(bus.id())) {
             return Err(wrong(
@@ -293,6 +322,8 @@ impl File {
             path: path.to_owned(),
             host: self.host,
             data: folder.join(self.data),
+            labels: self.labels,
+            clock_offset_s: self.clock_offset_s,
             realtime: self.realtime,
             cell,
             api_listen: self.api.listen,
@@ -475,7 +506,7 @@ mod tests {
     #[test]
     fn bad_files_say_where_and_what_helps() {
         let bus = "[[bus]]\nid = \"plant\"\ndriver = \"sim\"\n";
-        let table: [(String, &[&str]); 21] = [
+        let table: [(String, &[&str]); 23] = [
             (
                 format!("{LEAST}[testing]\nflip_bits_every = 5"),
                 &["key testing", "cell demo may be a real one", "begins with \"test\""],
@@ -483,6 +514,14 @@ mod tests {
             (
                 "host = \"a\"\n[cell]\nname = \"test-1\"\n[testing]\nflip_bits_every = 0".into(),
                 &["key testing.flip_bits_every", "it is 0"],
+            ),
+            (
+                "host = \"a\"\nlabels = [\"East\"]\n[cell]\nname = \"demo\"".into(),
+                &["key labels", "\"East\" is no label", "lower-case"],
+            ),
+            (
+                "host = \"a\"\nclock_offset_s = -99999999\n[cell]\nname = \"demo\"".into(),
+                &["key clock_offset_s", "a year, either way"],
             ),
             (String::new(), &["host.toml", "missing field `host`"]),
             (

@@ -41,6 +41,10 @@ pub struct Vitals {
     pub loops_held: u32,
     /// It is about to leave: give it nothing new.
     pub draining: bool,
+    /// It stays so over a restart.
+    pub drain_kept: bool,
+    /// Words that it goes by besides its name, for what loops prefer.
+    pub labels: Vec<String>,
     /// Version of the program.
     pub version: String,
 }

@@ -230,6 +230,7 @@ pub(crate) fn test_spec() -> LoopSpec {
         listens: Vec::new(),
         fallback: None,
         fallback_parameters: std::collections::BTreeMap::new(),
+        prefer: vec![],
         policy: Policy::default(),
     }
 }

@@ -45,6 +45,16 @@ pub const PERIOD_NS_MAX: u64 = 3_600_000_000_000;
 /// Replicas of one loop: beyond a handful, more copies add traffic and no availability.
 pub const REPLICAS_MAX: usize = 16;
 
+/// Periods that may lie between two cycles as a controller and its rate limits see it: some lost cycles are made up for, an
+/// outage is not.
+pub const DT_PERIODS_MAX: u64 = 10;
+
+/// Words of a loop's preference among hosts: a first choice, a second, a site, a kind of machine.
+pub const PREFER_MAX: usize = 8;
+
+/// Labels of one host: they ride in its vitals, five times a second.
+pub const HOST_LABELS_MAX: usize = 16;
+
 /// Component size in bytes: a JavaScript engine in a component takes 13 MB.
 pub const COMPONENT_BYTES_MAX: usize = 32 * 1024 * 1024;
 

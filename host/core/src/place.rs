@@ -1,9 +1,29 @@
 //! Where loops live: rendezvous (highest random weight) hashing, the same on every host without talking.
 //!
 //! Source: Thaler and Ravishankar, "Using name-based mappings to increase hit rates", IEEE/ACM ToN 6(1), 1998. When a host
-//! leaves, only its own loops move. Never: looks at load or liveness; the caller gives the eligible hosts.
+//! leaves, only its own loops move. What a loop prefers goes before the hash. Never: looks at load or liveness; the caller
+//! gives the eligible hosts.
 
 use crate::name::{HostId, LoopId};
+
+/// A host that may hold loops.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Candidate {
+    /// The host.
+    pub host: HostId,
+    /// Words that it goes by besides its name, such as `east`; see [`crate::LoopSpec::prefer`].
+    pub labels: Vec<String>,
+}
+
+impl Candidate {
+    /// Place of the first word of `prefer` that is this host's name or one of its labels; the number of words where none
+    /// is. Less is better.
+    #[must_use]
+    pub fn preference(&self, prefer: &[String]) -> usize {
+        let is_it = |word: &String| word == self.host.as_str() || self.labels.contains(word);
+        prefer.iter().position(is_it).unwrap_or(prefer.len())
+    }
+}
 
 /// FNV-1a, 64 bits, then a final mix (SplitMix64's), because FNV alone leaves the high bits of short names alike.
 fn weight(parts: [&str; 2]) -> u64 {
@@ -31,10 +51,23 @@ pub fn rank(loop_id: &LoopId, hosts: &[HostId]) -> Vec<HostId> {
     weighed.into_iter().map(|(_, h)| h.clone()).collect()
 }
 
+/// All candidates, best first: those that the loop prefers, in the order of its words, and each alike by [`rank`].
+#[must_use]
+pub fn rank_preferring(loop_id: &LoopId, candidates: &[Candidate], prefer: &[String]) -> Vec<HostId> {
+    let hosts: Vec<HostId> = candidates.iter().map(|c| c.host.clone()).collect();
+    let mut ranked = rank(loop_id, &hosts);
+    // A stable sort: within one preference the rank stays.
+    ranked.sort_by_key(|host| {
+        let candidate = candidates.iter().find(|c| c.host == *host);
+        candidate.map_or(prefer.len(), |c| c.preference(prefer))
+    });
+    ranked
+}
+
 /// The hosts that hold this loop: the first `n` of the ranking.
 #[must_use]
-pub fn members(loop_id: &LoopId, eligible: &[HostId], n: usize) -> Vec<HostId> {
-    let mut ranked = rank(loop_id, eligible);
+pub fn members(loop_id: &LoopId, eligible: &[Candidate], prefer: &[String], n: usize) -> Vec<HostId> {
+    let mut ranked = rank_preferring(loop_id, eligible, prefer);
     ranked.truncate(n);
     ranked
 }
@@ -63,6 +96,39 @@ mod tests {
         (1..=count).map(|n| LoopId::new(format!("loop-{n}")).unwrap()).collect()
     }
 
+    fn candidates(hosts: &[HostId]) -> Vec<Candidate> {
+        let plain = |host: &HostId| Candidate {
+            host: host.clone(),
+            labels: vec![],
+        };
+        hosts.iter().map(plain).collect()
+    }
+
+    #[test]
+    fn what_a_loop_prefers_goes_before_the_hash() {
+        let id = LoopId::new("level-1").unwrap();
+        let mut all = candidates(&hosts(5));
+        all[0].labels = vec!["east".to_owned()];
+        all[3].labels = vec!["fast".to_owned(), "east".to_owned()];
+        let ranked = |prefer: &[&str]| -> Vec<String> {
+            let prefer: Vec<String> = prefer.iter().map(ToString::to_string).collect();
+            let ranked = rank_preferring(&id, &all, &prefer);
+            ranked.iter().map(ToString::to_string).collect()
+        };
+        assert_eq!(ranked(&[]), ["host-3", "host-4", "host-5", "host-2", "host-1"]);
+        assert_eq!(
+            ranked(&["nobody"]),
+            ranked(&[]),
+            "a word that nobody goes by changes nothing"
+        );
+        assert_eq!(ranked(&["host-2"]), ["host-2", "host-3", "host-4", "host-5", "host-1"]);
+        assert_eq!(ranked(&["east"]), ["host-4", "host-1", "host-3", "host-5", "host-2"]);
+        assert_eq!(
+            ranked(&["host-1", "fast", "host-5"]),
+            ["host-1", "host-4", "host-5", "host-3", "host-2"]
+        );
+    }
+
     #[test]
     fn the_ranking_is_the_same_in_every_version() {
         // A host of another version must agree, so these values never change.
@@ -89,7 +155,7 @@ mod tests {
         let count = |hosts: &[HostId], loops: &[LoopId]| {
             let mut counts = BTreeMap::new();
             for id in loops {
-                *counts.entry(members(id, hosts, 1)[0].clone()).or_insert(0_i64) += 1;
+                *counts.entry(rank(id, hosts)[0].clone()).or_insert(0_i64) += 1;
             }
             counts
         };
@@ -121,8 +187,8 @@ mod tests {
             let hosts = hosts(count);
             let gone = &hosts[gone.index(count)];
             let left: Vec<HostId> = hosts.iter().filter(|h| *h != gone).cloned().collect();
-            let before = members(&id, &hosts, n);
-            let after = members(&id, &left, n);
+            let before = members(&id, &candidates(&hosts), &[], n);
+            let after = members(&id, &candidates(&left), &[], n);
             // Those that stay keep their order, and at most one comes in, at the end.
             let kept: Vec<HostId> = before.iter().filter(|h| *h != gone).cloned().collect();
             prop_assert!(after.starts_with(&kept));

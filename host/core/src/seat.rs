@@ -13,7 +13,7 @@ use std::{collections::VecDeque, sync::Arc};
 use crate::{
     frame::{Cycle, Effects, Fault, Frame},
     guard,
-    limits::OUTCOMES_REMEMBERED_MAX,
+    limits::{DT_PERIODS_MAX, OUTCOMES_REMEMBERED_MAX},
     name::HostId,
     protocol::Sample,
     reading::Reading,
@@ -164,11 +164,15 @@ pub fn frame(
     }
 }
 
-/// Time since the base's sample, in ns; the period for a first cycle, and at least 1 where the home's clock came back
-/// from a restart earlier than it left.
+/// Time since the base's sample, in ns; the period for a first cycle. At least 1 and at most [`DT_PERIODS_MAX`] periods (or as
+/// many times the cycle before, where the period was just changed): over its restart a home knows no time but the machine's
+/// date, which may have been set, and a rate limit over an hour is none.
 #[must_use]
 pub fn dt_ns(base: Option<&Record>, spec: &LoopSpec, sample: &Sample) -> u64 {
-    base.map_or(spec.period_ns, |r| sample.at_ns.saturating_sub(r.at_ns).max(1))
+    base.map_or(spec.period_ns, |r| {
+        let longest_ns = spec.period_ns.max(r.dt_ns).saturating_mul(DT_PERIODS_MAX);
+        sample.at_ns.saturating_sub(r.at_ns).clamp(1, longest_ns.max(1))
+    })
 }
 
 /// Whom to ask for a step, and when to ask the next.

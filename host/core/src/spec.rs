@@ -8,8 +8,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     digest::Digest,
-    limits::{MESSAGES_PER_STEP_MAX, PERIOD_NS_MAX, PERIOD_NS_MIN, REPLICAS_MAX},
-    name::{LoopId, PointId},
+    limits::{MESSAGES_PER_STEP_MAX, PERIOD_NS_MAX, PERIOD_NS_MIN, PREFER_MAX, REPLICAS_MAX},
+    name::{HostId, LoopId, PointId},
 };
 
 /// Who decides the output.
@@ -239,6 +239,9 @@ pub struct LoopSpec {
     pub fallback: Option<Digest>,
     /// Parameters of the fallback, by name; what is not named it takes from the loop's, or from its own defaults.
     pub fallback_parameters: BTreeMap<String, f64>,
+    /// Where the loop would rather run: names and labels of hosts, the best first. Its members are chosen in this order, and
+    /// an owner of a better word gets the loop back once it has been well for some time. At most [`PREFER_MAX`] words.
+    pub prefer: Vec<String>,
     /// The bounds within which the host runs the loop.
     pub policy: Policy,
 }
@@ -289,6 +292,9 @@ pub enum SpecError {
     /// Too many topics, or one that is empty or too long.
     #[error("listens: at most {MESSAGES_PER_STEP_MAX} topics of 1 to 64 characters")]
     Listens,
+    /// Too many words, or one that no host can go by.
+    #[error("prefer: at most {PREFER_MAX} names or labels of hosts, of lower-case letters, digits, '-', '_' and '.'")]
+    Prefer,
     /// Out of range.
     #[error("policy: {0}")]
     Policy(&'static str),
@@ -343,6 +349,9 @@ impl LoopSpec {
         }
         if self.listens.len() > MESSAGES_PER_STEP_MAX || self.listens.iter().any(|t| t.is_empty() || t.len() > 64) {
             return Err(SpecError::Listens);
+        }
+        if self.prefer.len() > PREFER_MAX || self.prefer.iter().any(|word| HostId::new(word).is_err()) {
+            return Err(SpecError::Prefer);
         }
         let p = &self.policy;
         if !(0.01..=0.9).contains(&p.hedge_part) {

@@ -24,7 +24,7 @@ use crate::{
     error::{Error, Words},
     library::title,
     limits::{TRIAL_STACK_BYTES, TRIAL_WAIT},
-    room::{Room, unix_ms},
+    room::Room,
 };
 
 /// Interfaces that a controller may import; the engine refuses all others.
@@ -49,7 +49,13 @@ impl Room {
             .map_err(crowded)?
             .map_err(|_| stopping())?;
         let trial = on_own_thread(move || trial::run(&prepared)).await?;
-        Ok(report(&trial, self.here.clone(), imports, compile_time))
+        Ok(report(
+            &trial,
+            self.here.clone(),
+            imports,
+            compile_time,
+            self.clock.unix_ms(),
+        ))
     }
 }
 
@@ -78,7 +84,13 @@ async fn on_own_thread<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'sta
         .map_err(|_| Error::internal("the trial of a component ended badly"))
 }
 
-fn report(trial: &trial::Trial, host: HostId, imports: &[String], compile_time: Option<Duration>) -> Admission {
+fn report(
+    trial: &trial::Trial,
+    host: HostId,
+    imports: &[String],
+    compile_time: Option<Duration>,
+    checked_at_unix_ms: u64,
+) -> Admission {
     let mut findings = trial.findings.clone();
     let names: Vec<&str> = imports
         .iter()
@@ -105,7 +117,7 @@ fn report(trial: &trial::Trial, host: HostId, imports: &[String], compile_time: 
     findings.truncate(FINDINGS_MAX);
     let worst = findings.iter().map(|finding| finding.severity).max();
     Admission {
-        checked_at_unix_ms: unix_ms(),
+        checked_at_unix_ms,
         host,
         verdict: match worst {
             Some(Severity::Refusal) => Verdict::Refused,
@@ -216,6 +228,7 @@ mod tests {
             HostId::new("h").unwrap(),
             &imports,
             Some(Duration::from_millis(12)),
+            1,
         )
     }
 

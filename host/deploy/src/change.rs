@@ -13,7 +13,10 @@ mod readiness;
 
 use std::{sync::Arc, time::Duration};
 
-use bumpless_core::{Command, CommandBody, ComponentInfo, Event, HostId, Intent, LoopId, LoopSpec, Outcome, Record};
+use bumpless_core::{
+    Command, CommandBody, ComponentInfo, Event, HostId, Intent, LoopId, LoopSpec, Outcome, Record,
+    place::{self, Candidate},
+};
 use bumpless_loops::CommandReply;
 use futures_util::future::join_all;
 use tokio::{sync::oneshot, time::timeout};
@@ -256,7 +259,7 @@ impl Room {
                 "delete loops that are not needed",
             ));
         }
-        let members = bumpless_core::place::members(&id, &self.roster.eligible(), usize::from(spec.replicas));
+        let members = place::members(&id, &self.roster.eligible(), &spec.prefer, usize::from(spec.replicas));
         if members.is_empty() {
             return Err(nobody());
         }
@@ -381,7 +384,12 @@ impl Room {
     }
 
     /// From proposal to the first record, or to the reason why there is none.
-    async fn bring_in(self: &Arc<Self>, intent: &Intent, revision: u64, eligible: &[HostId]) -> Result<Revised, Error> {
+    async fn bring_in(
+        self: &Arc<Self>,
+        intent: &Intent,
+        revision: u64,
+        eligible: &[Candidate],
+    ) -> Result<Revised, Error> {
         let id = &intent.loop_id;
         let spec = intent
             .find(revision)

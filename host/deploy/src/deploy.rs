@@ -17,13 +17,13 @@ use crate::{
     draft::{Change, LoopDraft},
     error::Error,
     library::title,
-    limits::{ANSWER_MARGIN, ANSWER_WAIT, APPLY_WAIT, DRAIN_WAIT},
+    limits::{ANSWER_MARGIN, ANSWER_WAIT, APPLY_WAIT, DRAIN_ORDER_WAIT, DRAIN_SETTLE, DRAIN_WAIT},
     orders::command_wait,
     plan,
     room::{DeployArrival, Parts, Room},
     view::{
-        ApplyEnd, Call, CallEnd, CommandEnd, ComponentView, Counters, HostView, Imported, LoopView, PointView, Relabel,
-        StageView, Upload,
+        ApplyEnd, Call, CallEnd, CommandEnd, ComponentView, Counters, DrainEnd, DrainOrder, HostView, Imported,
+        LoopView, PointView, Relabel, StageView, Upload,
     },
     wire::{Amend, Ask, Told},
 };
@@ -31,9 +31,6 @@ use crate::{
 mod alarms;
 mod past;
 mod rollouts;
-
-/// Pause between two looks whether a draining host still owns loops.
-const DRAIN_LOOK: Duration = Duration::from_millis(20);
 
 /// One host's part in the cell. Clones share it. It lives until [`Deploy::shutdown`].
 #[derive(Clone)]
@@ -397,6 +394,26 @@ impl Deploy {
         all.map(|(id, seen)| self.room.host_view(id, &seen, now)).collect()
     }
 
+    /// Empties a host, or lets it take loops again. Its loops move between two cycles. Returns when it owns none any more, or
+    /// holds all that it shall; after 15 s it says how far it is.
+    ///
+    /// # Errors
+    /// [`Error::NotFound`], [`Error::Unreachable`], [`Error::Timeout`], [`Error::Store`] where the order shall hold over a
+    /// restart and the host's disk refuses it: nothing has changed then.
+    pub async fn drain(&self, host: &HostId, order: DrainOrder) -> Result<DrainEnd, Error> {
+        if !self.room.roster.all().iter().any(|(known, _)| known == host) {
+            return Err(Error::not_found(
+                format!("no host of the cell is named {host}"),
+                "list the hosts for their names",
+            ));
+        }
+        let wait = DRAIN_ORDER_WAIT + ANSWER_WAIT;
+        match self.room.ask(host, Ask::Drain(order), wait).await? {
+            Told::Drained(end) => Ok(end),
+            _ => Err(unexpected()),
+        }
+    }
+
     /// This host.
     #[must_use]
     pub fn here(&self) -> &HostId {
@@ -437,18 +454,17 @@ impl Deploy {
         self.room.set_draining(draining);
     }
 
-    /// Gives this host's loops away, waits at most 2 s until it owns none, brings the last records to the disk, and ends
+    /// Gives this host's loops away, waits at most 5 s until it owns none, brings the last records to the disk, and ends
     /// the tasks. The bus, the loops and the store are the caller's to close, afterwards.
     pub async fn shutdown(&self) {
         self.set_draining(true);
-        let others = self.room.roster.eligible().iter().any(|host| *host != self.room.here);
-        let until = tokio::time::Instant::now() + DRAIN_WAIT;
-        while others && self.room.field.owned() > 0 && tokio::time::Instant::now() < until {
-            tokio::time::sleep(DRAIN_LOOK).await;
-        }
+        self.room.wait_empty(DRAIN_WAIT).await;
         let owned = self.room.field.owned();
         if owned > 0 {
             tracing::warn!(owned, "the host stops while it owns loops; the others take them over");
+        }
+        if self.room.others_can_take() && self.room.holder.len() > 0 {
+            tokio::time::sleep(DRAIN_SETTLE).await;
         }
         self.room.stop();
         let room = Arc::clone(&self.room);
@@ -502,6 +518,8 @@ impl Room {
             io: vitals.is_some_and(|v| v.roles.io),
             control: vitals.is_some_and(|v| v.roles.control),
             draining: vitals.is_some_and(|v| v.draining),
+            drain_kept: vitals.is_some_and(|v| v.drain_kept),
+            labels: vitals.map(|v| v.labels.clone()).unwrap_or_default(),
             api: vitals.and_then(|v| v.api.clone()),
             cpu: vitals.map_or(0.0, |v| v.cpu),
             cpu_process: vitals.map_or(0.0, |v| v.cpu_process),

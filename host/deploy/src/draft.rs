@@ -61,6 +61,9 @@ pub struct LoopDraft {
     /// Its parameters, by name; what is not named it takes from `parameters`, or from its own defaults.
     #[serde(default)]
     pub fallback_parameters: BTreeMap<String, f64>,
+    /// Names and labels of hosts where the loop would rather run, the best first.
+    #[serde(default)]
+    pub prefer: Vec<String>,
     /// Fault, hedge, takeover and swap policy.
     #[serde(default)]
     pub policy: Policy,

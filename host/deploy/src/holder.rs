@@ -15,7 +15,10 @@ use std::{
     time::{Duration, Instant},
 };
 
-use bumpless_core::{HostId, Intent, LoopId, LoopSpec, place};
+use bumpless_core::{
+    HostId, Intent, LoopId, LoopSpec,
+    place::{self, Candidate},
+};
 use parking_lot::Mutex;
 
 use crate::{
@@ -133,13 +136,13 @@ pub(crate) fn wanted_revisions(intent: &Intent) -> Vec<&LoopSpec> {
 }
 
 /// The hosts that shall hold a loop.
-pub(crate) fn wanted_members(intent: &Intent, eligible: &[HostId]) -> Vec<HostId> {
+pub(crate) fn wanted_members(intent: &Intent, eligible: &[Candidate]) -> Vec<HostId> {
     let most = std::iter::once(&intent.current)
         .chain(&intent.pending)
         .map(|s| s.replicas)
         .max()
         .unwrap_or(1);
-    place::members(&intent.loop_id, eligible, usize::from(most))
+    place::members(&intent.loop_id, eligible, &intent.current.prefer, usize::from(most))
 }
 
 impl Room {
@@ -208,6 +211,14 @@ impl Room {
         self.tell_homes().await;
     }
 
+    /// Does this host hold all that it shall, in the revisions in force?
+    pub(crate) fn holds_all(&self) -> bool {
+        let eligible = self.roster.eligible();
+        let ours = |intent: &Arc<Intent>| wanted_members(intent, &eligible).contains(&self.here);
+        let held = |intent: &Arc<Intent>| self.holder.holds(&intent.loop_id, intent.current.revision);
+        self.book.all().iter().filter(|intent| ours(intent)).all(held)
+    }
+
     /// Lets go of revisions that are no longer needed, for loops that stay.
     fn keep_only(&self, id: &LoopId, wanted: &[u64]) {
         let mut held = self.holder.held.lock();
@@ -223,7 +234,7 @@ impl Room {
         }
     }
 
-    fn release_unwanted(&self, eligible: &[HostId]) {
+    fn release_unwanted(&self, eligible: &[Candidate]) {
         let now = Instant::now();
         self.holder.held.lock().retain(|id, entry| {
             let intent = self.book.get(id);

@@ -15,7 +15,10 @@ use std::{
     time::{Duration, Instant},
 };
 
-use bumpless_core::{ComponentInfo, Digest, HostId, Intent, LoopId, LoopSpec, PointId, Record, place};
+use bumpless_core::{
+    ComponentInfo, Digest, HostId, Intent, LoopId, LoopSpec, PointId, Record,
+    place::{self, Candidate},
+};
 use bumpless_loops::HomeRevision;
 use futures_util::future::join_all;
 use parking_lot::Mutex;
@@ -27,6 +30,7 @@ use crate::{
     holder::{wanted_members, wanted_revisions},
     limits::{ANSWER_WAIT, GATHER_WAIT, MOVE_WAIT, RECORDS_ASKED},
     plan::PointFacts,
+    preference::{Favourites, Look},
     room::{Locks, Room},
     wire::{Ask, Notice, Told},
 };
@@ -44,6 +48,8 @@ struct Opened {
     members: Vec<HostId>,
     /// An owner that shall give the loop away, and since when.
     leaving: Option<(HostId, Instant)>,
+    /// What is remembered of the hosts that it prefers.
+    favourites: Favourites,
 }
 
 /// The homes of this host.
@@ -102,6 +108,13 @@ impl Homes {
             .get(id)
             .map(|opened| opened.members.clone())
             .unwrap_or_default()
+    }
+
+    /// A person moved the loop there, whatever it prefers.
+    pub(crate) fn moved(&self, id: &LoopId, to: &HostId) {
+        if let Some(opened) = self.opened.lock().get_mut(id) {
+            opened.favourites.sent(to.clone(), Instant::now());
+        }
     }
 
     pub(crate) fn closed(&self, id: &LoopId) {
@@ -387,16 +400,32 @@ impl Room {
 
     /// Tells the loops who may own this one, if that changed. An owner that shall not stay moves the loop first; then this
     /// says that it must be looked at again.
-    fn tell_members(&self, intent: &Intent, eligible: &[HostId]) -> bool {
+    fn tell_members(&self, intent: &Intent, eligible: &[Candidate]) -> bool {
         let id = &intent.loop_id;
         // Held to the end, so that of two tellers at once the later one is also the one that is remembered.
         let mut all = self.homes.opened.lock();
         let Some(opened) = all.get_mut(id) else { return false };
         let n = usize::from(intent.current.replicas);
         let wanted: Vec<HostId> = wanted_members(intent, eligible).into_iter().take(n).collect();
-        let ranked = place::rank(id, eligible);
+        let ranked = place::rank_preferring(id, eligible, &intent.current.prefer);
         let ready = |host: &HostId| self.homes.is_ready(host, id, intent.current.revision);
         let mut members = members_now(&wanted, &ranked, n, &ready);
+        if !intent.current.prefer.is_empty() && opened.leaving.is_none() {
+            let owner = self.field.home_view(id).and_then(|view| view.owner);
+            let look = Look {
+                candidates: eligible,
+                prefer: &intent.current.prefer,
+                members: &members,
+                owner: owner.as_ref(),
+                ready: &ready,
+                draining: &|host| self.roster.draining(host),
+            };
+            if let Some(host) = opened.favourites.look(self.clock.now_ns(), Instant::now(), &look) {
+                tracing::info!(loop_id = %id, %host, "the loop goes back to the host that it prefers");
+                // Where the worker is too busy the next look asks again.
+                let _ = self.field.move_to(id, host);
+            }
+        }
         if members == opened.members && opened.leaving.is_none() {
             return false;
         }

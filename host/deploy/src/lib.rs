@@ -15,7 +15,7 @@
 //! by notices and, where those get lost, by comparing marks every second.
 //!
 //! Reading order: `draft`, `view`, `error` (what people see); `wire`, `field` (what this room speaks); `plan` (pure);
-//! `book`, `library`, `roster`, `feed` (what it keeps); `admission`, `bench`, `holder`, `home`, `change`, `orders` (what it does);
+//! `book`, `library`, `roster`, `feed` (what it keeps); `admission`, `bench`, `holder`, `home`, `preference`, `drain`, `change`, `orders` (what it does);
 //! `trials` with `rehearsal`, `verdict`, `replay`, `shadows`, `curve`, `report` (looking back, and trying candidates);
 //! `rollout` (one component for many loops, by rule);
 //! `sync`, `answers`, `service`, `room`, `deploy` (how it hangs together).
@@ -30,6 +30,7 @@ mod bundle;
 mod change;
 mod curve;
 mod deploy;
+mod drain;
 mod error;
 mod feed;
 mod field;
@@ -38,6 +39,7 @@ mod home;
 mod library;
 mod orders;
 mod plan;
+mod preference;
 mod rehearsal;
 mod replay;
 mod room;
@@ -63,6 +65,6 @@ pub use error::{Error, Words};
 pub use field::{CallSink, CommandSink, Field, WithdrawSink};
 pub use room::{DeployArrival, Parts};
 pub use view::{
-    ApplyEnd, Call, CallEnd, CommandEnd, ComponentView, Counters, FailureView, HandOverView, HostView, Imported,
-    LoopView, PointView, Relabel, Stage, StageView, Upload,
+    ApplyEnd, Call, CallEnd, CommandEnd, ComponentView, Counters, DrainEnd, DrainOrder, FailureView, HandOverView,
+    HostView, Imported, LoopView, PointView, Relabel, Stage, StageView, Upload,
 };

@@ -128,8 +128,16 @@ pub const MOVE_WAIT: Duration = Duration::from_secs(5);
 /// Shortest and longest pause before something that failed is tried again.
 pub const BACK_OFF: (Duration, Duration) = (Duration::from_millis(500), Duration::from_secs(60));
 
-/// How long a stopping host waits until others have its loops.
-pub const DRAIN_WAIT: Duration = Duration::from_secs(2);
+/// How long a stopping host waits until others have its loops: their homes look within 200 ms, and most loops have a cycle
+/// within a second. A supervisor that kills what does not stop waits longer than this.
+pub const DRAIN_WAIT: Duration = Duration::from_secs(5);
+
+/// How long a stopping host that owns nothing any more goes on answering: homes strike it off the list of replicas when
+/// they have seen the new owner's record, at most two looks later.
+pub const DRAIN_SETTLE: Duration = Duration::from_millis(600);
+
+/// How long an order to drain, or to take loops again, waits for its end before it says how far it is.
+pub const DRAIN_ORDER_WAIT: Duration = Duration::from_secs(15);
 
 /// How long a host that went is still shown.
 pub const GONE_SHOWN: Duration = Duration::from_secs(600);

@@ -167,7 +167,9 @@ impl Room {
             ));
         }
         self.field
-            .move_to(id, to)
-            .map_err(|error| Error::busy(chain(&error), ""))
+            .move_to(id, to.clone())
+            .map_err(|error| Error::busy(chain(&error), ""))?;
+        self.homes.moved(id, &to);
+        Ok(())
     }
 }

@@ -88,6 +88,7 @@ pub(crate) fn spec(
         listens: draft.listens.clone(),
         fallback: fallback_digest(draft)?,
         fallback_parameters: draft.fallback_parameters.clone(),
+        prefer: draft.prefer.clone(),
         policy: draft.policy,
     };
     complete(spec, descriptor, ground)

@@ -14,7 +14,7 @@ use std::{
         Arc,
         atomic::{AtomicBool, AtomicU64, Ordering},
     },
-    time::{Duration, Instant, SystemTime, UNIX_EPOCH},
+    time::{Duration, Instant},
 };
 
 use bumpless_cell::{Arrival, Probe, Roles, Session, Vitals};
@@ -34,6 +34,7 @@ use crate::{
     alarms::Alarms,
     bench::Bench,
     book::Book,
+    drain,
     error::{Error, Words, chain},
     feed::Feed,
     field::Field,
@@ -72,6 +73,8 @@ pub struct Parts {
     pub roles: Roles,
     /// Where its API listens.
     pub api: Option<String>,
+    /// Words that it goes by besides its name, for what loops prefer.
+    pub labels: Vec<String>,
     /// Version of the program.
     pub version: String,
 }
@@ -163,6 +166,8 @@ pub(crate) struct Room {
     pub(crate) comparing: Mutex<Comparing>,
     own: Mutex<Vitals>,
     draining: AtomicBool,
+    /// The drain holds over a restart.
+    pub(crate) drain_kept: AtomicBool,
     poke_homes: Notify,
     poke_holds: Notify,
     notices: mpsc::Sender<(HostId, Notice)>,
@@ -188,13 +193,16 @@ impl Room {
             field,
             roles,
             api,
+            labels,
             version,
         } = parts;
+        // A host that was to stay empty over its restart says so from its first word on.
+        let drain_kept = store.host_value::<bool>(drain::KEPT)?.unwrap_or(false);
         let here = session.host().clone();
         let own = Vitals {
             host: here.clone(),
             seq: 0,
-            started_at_ms: unix_ms(),
+            started_at_ms: clock.unix_ms(),
             roles,
             api,
             cpu: 0.0,
@@ -203,7 +211,9 @@ impl Room {
             ready: Vec::new(),
             loops_owned: 0,
             loops_held: 0,
-            draining: false,
+            draining: drain_kept,
+            drain_kept,
+            labels,
             version,
         };
         let (notices, arrived) = mpsc::channel(NOTICES_WAITING_MAX);
@@ -232,7 +242,8 @@ impl Room {
             admission: tokio::sync::Mutex::default(),
             comparing: Mutex::default(),
             own: Mutex::new(own),
-            draining: AtomicBool::new(false),
+            draining: AtomicBool::new(drain_kept),
+            drain_kept: AtomicBool::new(drain_kept),
             poke_homes: Notify::new(),
             poke_holds: Notify::new(),
             notices,
@@ -466,6 +477,7 @@ impl Room {
             own.loops_owned = self.field.owned();
             own.loops_held = u32::try_from(self.holder.len()).unwrap_or(u32::MAX);
             own.draining = self.draining.load(Ordering::Acquire);
+            own.drain_kept = self.drain_kept.load(Ordering::Acquire);
             own.clone()
         };
         self.field.set_host(&vitals);
@@ -473,6 +485,11 @@ impl Room {
         if self.roster.vitals(vitals) {
             self.poke();
         }
+    }
+
+    /// Is this host being emptied?
+    pub(crate) fn is_draining(&self) -> bool {
+        self.draining.load(Ordering::Acquire)
     }
 
     /// Gives this host's loops away, or takes loops again.
@@ -571,10 +588,4 @@ pub(crate) fn every(period: Duration) -> tokio::time::Interval {
     let mut tick = tokio::time::interval(period);
     tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
     tick
-}
-
-/// Now, in ms of Unix time; a clock that was never set counts from 0.
-pub(crate) fn unix_ms() -> u64 {
-    let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-    u64::try_from(since.as_millis()).unwrap_or(u64::MAX)
 }

@@ -1,6 +1,8 @@
 //! Who is there, and how they are.
 //!
 //! Owns: liveliness and the latest vitals of each host, this one included.
+//! Two lives of one host are told apart by what they say of their start, and not put in order by it: their machine's date
+//! may have gone back between them.
 //! Never: asks anybody. Liveliness alone decides who is there: vitals that are late say that a host is busy.
 //!
 //! ```text
@@ -13,7 +15,7 @@ use std::{
 };
 
 use bumpless_cell::Vitals;
-use bumpless_core::HostId;
+use bumpless_core::{HostId, place::Candidate};
 use parking_lot::Mutex;
 
 use crate::limits::{GONE_SHOWN, HOSTS_MAX, VITALS_FRESH};
@@ -24,6 +26,8 @@ pub(crate) struct Seen {
     pub(crate) there: bool,
     pub(crate) vitals: Option<Vitals>,
     pub(crate) changed: Instant,
+    /// Start of the life before the present one, in ms of its own date: what it still sends counts no more.
+    life_before: Option<u64>,
 }
 
 impl Seen {
@@ -48,6 +52,7 @@ impl Roster {
             there: true,
             vitals: Some(own),
             changed: Instant::now(),
+            life_before: None,
         };
         Self {
             seen: Mutex::new(BTreeMap::from([(here.clone(), seen)])),
@@ -68,6 +73,7 @@ impl Roster {
             there: false,
             vitals: None,
             changed: now,
+            life_before: None,
         });
         entry.changed = now;
         edit(entry)
@@ -87,12 +93,19 @@ impl Roster {
     pub(crate) fn vitals(&self, vitals: Vitals) -> bool {
         let host = vitals.host.clone();
         self.change(&host, |seen| {
-            // Of one process the later counts; of two the one that started later.
-            let order = |v: &Vitals| (v.started_at_ms, v.seq);
-            if seen.vitals.as_ref().is_some_and(|old| order(old) > order(&vitals)) {
-                return false;
+            if let Some(old) = &seen.vitals {
+                if old.started_at_ms == vitals.started_at_ms {
+                    // Of one life the later counts.
+                    if old.seq > vitals.seq {
+                        return false;
+                    }
+                } else if seen.life_before == Some(vitals.started_at_ms) {
+                    return false;
+                } else {
+                    seen.life_before = Some(old.started_at_ms);
+                }
             }
-            let part = |v: &Vitals| (v.roles, v.draining);
+            let part = |v: &Vitals| (v.roles, v.draining, v.labels.clone());
             let news = seen.vitals.as_ref().map(part) != Some(part(&vitals));
             seen.vitals = Some(vitals);
             news
@@ -125,13 +138,31 @@ impl Roster {
 
     /// Hosts that may hold loops: there, with the role, not being emptied. Where only hosts that are being emptied are
     /// left, those: a loop that runs on a leaving host is better than one that does not run.
-    pub(crate) fn eligible(&self) -> Vec<HostId> {
-        let staying = self.filter(|v| v.roles.control && !v.draining);
-        if staying.is_empty() {
-            self.filter(|v| v.roles.control)
-        } else {
-            staying
+    pub(crate) fn eligible(&self) -> Vec<Candidate> {
+        let mut all: Vec<(Candidate, bool)> = {
+            let seen = self.seen.lock();
+            let there = seen.iter().filter(|(_, s)| s.there);
+            let known = there.filter_map(|(h, s)| s.vitals.as_ref().map(|v| (h, v)));
+            let candidate = |(host, vitals): (&HostId, &Vitals)| {
+                let candidate = Candidate {
+                    host: host.clone(),
+                    labels: vitals.labels.clone(),
+                };
+                (candidate, vitals.draining)
+            };
+            known.filter(|(_, v)| v.roles.control).map(candidate).collect()
+        };
+        if all.iter().any(|(_, draining)| !draining) {
+            all.retain(|(_, draining)| !draining);
         }
+        all.into_iter().map(|(candidate, _)| candidate).collect()
+    }
+
+    /// Is the host being emptied, as far as it said?
+    pub(crate) fn draining(&self, host: &HostId) -> bool {
+        let seen = self.seen.lock();
+        let vitals = seen.get(host).and_then(|s| s.vitals.as_ref());
+        vitals.is_some_and(|v| v.draining)
     }
 
     fn filter(&self, wanted: impl Fn(&Vitals) -> bool) -> Vec<HostId> {
@@ -172,6 +203,8 @@ mod tests {
             loops_owned: 0,
             loops_held: 0,
             draining,
+            drain_kept: false,
+            labels: vec![],
             version: String::new(),
         }
     }
@@ -180,19 +213,48 @@ mod tests {
     fn liveliness_decides_and_draining_hosts_are_the_last_resort() {
         let name = |h: &str| HostId::new(h).unwrap();
         let roster = Roster::new(vitals("io", 1, false));
-        assert_eq!((roster.with_io(), roster.eligible()), (vec![name("io")], vec![]));
+        let eligible = |roster: &Roster| -> Vec<HostId> { roster.eligible().into_iter().map(|c| c.host).collect() };
+        assert_eq!((roster.with_io(), eligible(&roster)), (vec![name("io")], vec![]));
         roster.vitals(vitals("a", 1, false));
-        assert!(roster.eligible().is_empty(), "vitals alone do not make a host be there");
+        assert!(eligible(&roster).is_empty(), "vitals alone do not make a host be there");
         assert!(roster.up(&name("a")) && !roster.up(&name("a")));
         assert!(roster.up(&name("b")) && roster.vitals(vitals("b", 5, false)));
-        assert_eq!(roster.eligible(), [name("a"), name("b")]);
+        assert_eq!(eligible(&roster), [name("a"), name("b")]);
         assert!(roster.vitals(vitals("b", 6, true)), "draining is news");
         assert!(!roster.vitals(vitals("b", 5, false)), "older vitals are not");
-        assert_eq!(roster.eligible(), [name("a")]);
+        assert_eq!(eligible(&roster), [name("a")]);
         assert!(roster.down(&name("a")) && !roster.down(&name("a")));
-        assert_eq!(roster.eligible(), [name("b")]);
+        assert_eq!(eligible(&roster), [name("b")]);
         assert!(!roster.down(&name("io")), "this host never goes");
         assert_eq!(roster.others(), [name("b")]);
+    }
+
+    #[test]
+    fn a_life_whose_date_went_back_is_believed_and_the_life_before_is_not() {
+        let name = |h: &str| HostId::new(h).unwrap();
+        let life = |started_at_ms, seq, draining| Vitals {
+            started_at_ms,
+            ..vitals("b", seq, draining)
+        };
+        let roster = Roster::new(vitals("a", 1, false));
+        roster.up(&name("b"));
+        let draining = || roster.draining(&name("b"));
+        // A day passes, and the host stops in good order.
+        roster.vitals(life(86_400_000, 900, true));
+        assert!(draining());
+        roster.down(&name("b"));
+        // It comes back with its date a day earlier.
+        roster.up(&name("b"));
+        assert!(roster.vitals(life(5, 1, false)));
+        assert!(!draining(), "what the new life says counts");
+        assert!(
+            !roster.vitals(life(86_400_000, 901, true)),
+            "what the old one still sent comes too late"
+        );
+        assert!(!draining());
+        // And again, to a date before that of the first life.
+        assert!(roster.vitals(life(3, 1, true)) && draining());
+        assert!(!roster.vitals(life(5, 2, false)) && draining());
     }
 
     #[test]

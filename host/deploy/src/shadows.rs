@@ -26,7 +26,6 @@ use crate::{
     error::Error,
     rehearsal::Rehearsal,
     report::{ShadowView, TrialReport},
-    room::unix_ms,
 };
 
 /// Shadows that follow loops at one home at a time. Each steps a component as often as its loop does.
@@ -153,13 +152,14 @@ impl Shadows {
         drop(old);
     }
 
-    /// Lets a candidate follow a loop that runs component `recorded`, for so many cycles.
+    /// Lets a candidate follow a loop that runs component `recorded`, for so many cycles. `at_unix_ms` is now, for people.
     pub(crate) fn start(
         &self,
         rehearsal: Rehearsal,
         loop_id: LoopId,
         recorded: Digest,
         cycles: u64,
+        at_unix_ms: u64,
     ) -> Result<ShadowView, Error> {
         let mut all = self.all.lock();
         let following = all
@@ -179,7 +179,7 @@ impl Shadows {
             id: self.ids.fetch_add(1, Ordering::Relaxed) + 1,
             loop_id,
             cycles_wanted: cycles,
-            started_at_unix_ms: unix_ms(),
+            started_at_unix_ms: at_unix_ms,
             missed: Arc::default(),
             running: Arc::new(AtomicBool::new(true)),
             desk: Arc::new(Mutex::new(Desk::Following(Box::new(rehearsal)))),

@@ -321,7 +321,7 @@ impl Room {
                 let rehearsal = Rehearsal::new(self.candidate(from, &id, *trial).await?, self.finder(&id));
                 Box::new(move || {
                     room.shadows
-                        .start(rehearsal, id, current.digest, cycles)
+                        .start(rehearsal, id, current.digest, cycles, room.clock.unix_ms())
                         .map(|view| vec![view])
                 })
             }

@@ -22,7 +22,7 @@ use crate::{
     error::Error,
     library::title,
     limits::{BUNDLE_BYTES_MAX, BUNDLE_COMPONENTS_MAX, UPLOAD_WAIT},
-    room::{Room, count, unix_ms},
+    room::{Room, count},
     view::{Imported, Relabel, Upload},
     wire::Notice,
 };
@@ -95,7 +95,7 @@ impl Room {
             world: CONTROLLER_WORLD.to_owned(),
             imports: inspection.imports,
             bytes: inspection.bytes as u64,
-            uploaded_at_unix_ms: unix_ms(),
+            uploaded_at_unix_ms: self.clock.unix_ms(),
             uploaded_by: upload.by.clone(),
             note: upload.note.clone(),
             labels: upload.labels.clone(),
@@ -199,7 +199,7 @@ impl Room {
             return Ok(Arc::new(info));
         }
         info.changes += 1;
-        info.remember(unix_ms(), &change.by, &what.join(", "));
+        info.remember(self.clock.unix_ms(), &change.by, &what.join(", "));
         info.check().map_err(|error| Error::invalid(error.to_string(), ""))?;
         let info = Arc::new(info);
         self.library.keep(Arc::clone(&info), None).await?;
@@ -224,7 +224,7 @@ impl Room {
                 "swap or delete them; a loop also keeps the component that it can go back to",
             ));
         }
-        let at_ms = unix_ms().max(info.uploaded_at_unix_ms);
+        let at_ms = self.clock.unix_ms().max(info.uploaded_at_unix_ms);
         self.component_gone(info.digest, at_ms).await?;
         self.announce(&Notice::ComponentGone(info.digest, at_ms));
         Ok(())

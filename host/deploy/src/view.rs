@@ -118,6 +118,33 @@ pub struct FailureView {
     pub tries: u32,
 }
 
+/// Empties a host, or lets it take loops again.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+pub struct DrainOrder {
+    /// Shall it be emptied?
+    pub drain: bool,
+    /// Does that hold over a restart? Only of meaning with `drain`.
+    pub keep: bool,
+}
+
+/// How far a host is with an order to drain.
+#[derive(Debug, Clone, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+pub struct DrainEnd {
+    /// The host.
+    pub host: HostId,
+    /// Is it being emptied?
+    pub draining: bool,
+    /// Does that hold over a restart?
+    pub kept: bool,
+    /// Loops that it still owns. More than none after an order to drain: nobody else can take them, or their next cycle is
+    /// yet to come.
+    pub loops_owned: u32,
+    /// Loops that it holds.
+    pub loops_held: u32,
+    /// Does it hold all that it shall? After an order to take loops again: whether it is ready to be a replica of each.
+    pub ready: bool,
+}
+
 /// A host as another sees it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct HostView {
@@ -133,6 +160,10 @@ pub struct HostView {
     pub control: bool,
     /// Is it being emptied?
     pub draining: bool,
+    /// Does it stay so over a restart?
+    pub drain_kept: bool,
+    /// Words that it goes by besides its name.
+    pub labels: Vec<String>,
     /// Address of its API.
     pub api: Option<String>,
     /// Load of the cores that it may use, 0 to 1.

@@ -18,7 +18,7 @@ use crate::{
     error::{Error, Words},
     report::{CyclesView, ReplayReport, ShadowView, Trial, TrialReport},
     rollout::RolloutView,
-    view::{ApplyEnd, CommandEnd, PointView, Stage},
+    view::{ApplyEnd, CommandEnd, DrainEnd, DrainOrder, PointView, Stage},
 };
 
 /// Version of these lists. Another one is refused in words, so that a half updated cell says what is the matter.
@@ -40,6 +40,8 @@ pub(crate) enum Ask {
     Delete(LoopId),
     /// To the home: give the ownership to another member.
     Move(LoopId, HostId),
+    /// To a host: give your loops away, or take loops again.
+    Drain(DrainOrder),
     /// To a member: could you run this? Nothing stays.
     Try(Box<LoopSpec>),
     /// To a member: make this revision of the intent ready, and say when it is.
@@ -174,6 +176,8 @@ pub(crate) enum Told {
     Applied(ApplyEnd),
     /// How a command ended.
     Commanded(CommandEnd),
+    /// How far a host is with being emptied, or filled again.
+    Drained(DrainEnd),
     /// Which of the points are served there, in the order of the question.
     Found(Vec<bool>),
     /// A page of points, and how many there are in all.
@@ -320,6 +324,7 @@ mod tests {
             listens: vec![],
             fallback: None,
             fallback_parameters: BTreeMap::from([("k".into(), 0.5)]),
+            prefer: vec!["a".into()],
             policy: Policy::default(),
         };
         for ask in [Ask::Apply(Box::new(draft)), Ask::Library, Ask::Points(7)] {

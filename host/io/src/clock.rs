@@ -16,12 +16,31 @@ impl Clock {
     /// Looks at the wall clock, once.
     #[must_use]
     pub fn start() -> Self {
+        Self::start_off_by(0)
+    }
+
+    /// As if the wall clock were this many seconds ahead, or behind where that is negative. For drills: no decision of a cell
+    /// may depend on the date.
+    #[must_use]
+    pub fn start_off_by(offset_s: i64) -> Self {
         // A wall clock before 1970 is a clock that was never set: the steady part still works.
         let unix = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+        let offset_ns = offset_s.unsigned_abs().saturating_mul(1_000_000_000);
+        let unix_at_start_ns = if offset_s < 0 {
+            saturating_ns(unix).saturating_sub(offset_ns)
+        } else {
+            saturating_ns(unix).saturating_add(offset_ns)
+        };
         Self {
-            unix_at_start_ns: saturating_ns(unix),
+            unix_at_start_ns,
             start: Instant::now(),
         }
+    }
+
+    /// Now, in ms since 1970 by the date at the start: for people.
+    #[must_use]
+    pub fn unix_ms(&self) -> u64 {
+        self.now_ns() / 1_000_000
     }
 
     /// Now, in ns. Two calls on any threads never go back.
@@ -40,6 +59,20 @@ fn saturating_ns(duration: std::time::Duration) -> u64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_drill_moves_the_date_and_not_the_pace() {
+        let (now, ahead, behind) = (Clock::start(), Clock::start_off_by(7200), Clock::start_off_by(-7200));
+        let hours = |a: Clock, b: Clock| (a.now_ns() as f64 - b.now_ns() as f64) / 3.6e12;
+        assert!((hours(ahead, now) - 2.0).abs() < 0.01 && (hours(now, behind) - 2.0).abs() < 0.01);
+        let before = ahead.now_ns();
+        assert!(ahead.now_ns() >= before && ahead.unix_ms() >= before / 1_000_000);
+        assert_eq!(
+            Clock::start_off_by(i64::MIN).now_ns() / 3_600_000_000_000,
+            0,
+            "before 1970 is 1970"
+        );
+    }
 
     #[test]
     fn never_goes_back_and_means_a_date() {

@@ -10,8 +10,8 @@ use bumpless_core::{
     Migrated, Mode, Outcome, PointId, Policy, PortKind, PortSpec, Reading, Record, Strategy, desk::Tally,
 };
 use bumpless_deploy::{
-    ApplyEnd, Call, CallEnd, Change, CommandEnd, ComponentView, Counters, Error, HostView, Imported, LoopDraft,
-    LoopView, PointView, Relabel, Stage, StageView, Upload,
+    ApplyEnd, Call, CallEnd, Change, CommandEnd, ComponentView, Counters, DrainEnd, DrainOrder, Error, HostView,
+    Imported, LoopDraft, LoopView, PointView, Relabel, Stage, StageView, Upload,
 };
 use bumpless_deploy::{
     Window,
@@ -245,6 +245,7 @@ pub(crate) fn view(name: &str) -> LoopView {
             listens: Vec::new(),
             fallback: None,
             fallback_parameters: Default::default(),
+            prefer: vec![],
             policy: Policy::default(),
         },
         pending: None,
@@ -504,6 +505,8 @@ impl Cell for Fake {
             io: true,
             control: true,
             draining: false,
+            drain_kept: false,
+            labels: vec!["east".to_owned()],
             api: None,
             cpu: 0.25,
             cpu_process: 0.1,
@@ -513,6 +516,17 @@ impl Cell for Fake {
             loops_held: 1,
             version: "0.1.0".into(),
         }]
+    }
+
+    fn drain(&self, host: HostId, order: DrainOrder) -> Answer<DrainEnd> {
+        self.answer(DrainEnd {
+            host,
+            draining: order.drain,
+            kept: order.keep,
+            loops_owned: 0,
+            loops_held: 2,
+            ready: true,
+        })
     }
 
     fn here(&self) -> HostId {

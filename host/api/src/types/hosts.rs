@@ -1,6 +1,6 @@
 //! Hosts and points.
 
-use bumpless_deploy::{HostView, PointView};
+use bumpless_deploy::{DrainEnd, HostView, PointView};
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
@@ -28,6 +28,12 @@ pub struct Host {
     pub control: bool,
     /// Is it being emptied?
     pub draining: bool,
+    /// Does it stay so over a restart?
+    #[serde(default)]
+    pub drain_kept: bool,
+    /// Words that it goes by besides its name, for what loops prefer.
+    #[serde(default)]
+    pub labels: Vec<String>,
     /// Address of its API.
     pub api: Option<String>,
     /// Load of the cores that it may use, in %.
@@ -55,6 +61,8 @@ impl From<HostView> for Host {
             io: view.io,
             control: view.control,
             draining: view.draining,
+            drain_kept: view.drain_kept,
+            labels: view.labels,
             api: view.api,
             cpu_percent: rounded(f64::from(view.cpu) * 100.0),
             cpu_process_cores: rounded(f64::from(view.cpu_process)),
@@ -63,6 +71,45 @@ impl From<HostView> for Host {
             loops_owned: view.loops_owned,
             loops_held: view.loops_held,
             version: view.version,
+        }
+    }
+}
+
+/// Empties a host.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct DrainRequest {
+    /// Shall it stay empty over a restart, until it is undrained?
+    pub keep: bool,
+}
+
+/// How far a host is with being emptied, or filled again.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct Drain {
+    /// The host.
+    pub host: String,
+    /// Is it being emptied?
+    pub draining: bool,
+    /// Does that hold over a restart?
+    pub kept: bool,
+    /// Loops that it still owns. After an order to drain, more than none means: nobody else can take them, or their next
+    /// cycle is yet to come.
+    pub loops_owned: u32,
+    /// Loops that it holds: owned, or ready to take over.
+    pub loops_held: u32,
+    /// Does it hold all that it shall?
+    pub ready: bool,
+}
+
+impl From<DrainEnd> for Drain {
+    fn from(end: DrainEnd) -> Self {
+        Self {
+            host: end.host.to_string(),
+            draining: end.draining,
+            kept: end.kept,
+            loops_owned: end.loops_owned,
+            loops_held: end.loops_held,
+            ready: end.ready,
         }
     }
 }

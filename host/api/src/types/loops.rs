@@ -63,6 +63,11 @@ pub struct LoopDraft {
     /// Its parameters, by name; what is not named it takes from `parameters`, or from its own defaults.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub fallback_parameters: BTreeMap<String, f64>,
+    /// Where the loop would rather run: names and labels of hosts, the best first; at most 8. Its members are chosen in this
+    /// order, and a better one gets the loop back, without a gap, once it has been well for 5 s (longer where it keeps
+    /// failing).
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub prefer: Vec<String>,
     /// Fault, hedge, takeover and swap policy.
     #[serde(default)]
     pub policy: Policy,
@@ -198,6 +203,7 @@ impl From<LoopDraft> for deploy::LoopDraft {
             listens: draft.listens,
             fallback: draft.fallback,
             fallback_parameters: draft.fallback_parameters,
+            prefer: draft.prefer,
             policy: draft.policy.into(),
         }
     }
@@ -381,6 +387,7 @@ fn draft(spec: &model::LoopSpec, component: &str) -> LoopDraft {
         listens: spec.listens.clone(),
         fallback: spec.fallback.map(|digest| digest.to_string()),
         fallback_parameters: spec.fallback_parameters.clone(),
+        prefer: spec.prefer.clone(),
         policy: spec.policy.into(),
     }
 }

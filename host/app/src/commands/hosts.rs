@@ -1,11 +1,80 @@
 //! `hosts` and `points`.
 
-use bumpless_api::types::{Hosts, Points, Quality};
+use std::time::{Duration, Instant};
 
-use crate::{client::Client, error::Error, show};
+use bumpless_api::types::{Drain, DrainRequest, Hosts, Points, Quality};
+
+use crate::{
+    cli::HostsCommand,
+    client::{Answer, Client, encoded},
+    error::Error,
+    show,
+};
+
+/// Pause before a host that is not there is asked again.
+const ASK_AGAIN: Duration = Duration::from_millis(250);
+
+/// Runs what was typed.
+pub(crate) fn run(client: &Client, json: bool, what: HostsCommand) -> Result<(), Error> {
+    match what {
+        HostsCommand::List => list(client, json),
+        HostsCommand::Drain { host, keep } => {
+            let path = format!("/v1/hosts/{}/drain", encoded(&host));
+            let answer = client.post(&path, &DrainRequest { keep })?;
+            told(&answer, json)
+        }
+        HostsCommand::Undrain { host, wait } => {
+            let path = format!("/v1/hosts/{}/undrain", encoded(&host));
+            let until = Instant::now() + Duration::from_secs(wait);
+            loop {
+                match client.post(&path, &serde_json::json!({})) {
+                    Err(error) if Instant::now() < until => {
+                        // Not there yet, or not known to the host that was asked.
+                        tracing::debug!(%error, "asked again");
+                        std::thread::sleep(ASK_AGAIN);
+                    }
+                    answer => return told(&answer?, json),
+                }
+            }
+        }
+    }
+}
+
+/// Prints how far a host is; a host that is not where it was sent is a failure.
+fn told(answer: &Answer, json: bool) -> Result<(), Error> {
+    let end: Drain = answer.decode()?;
+    let owned = end.loops_owned;
+    if json {
+        show::json(&answer.text)?;
+    } else if end.draining {
+        let kept = if end.kept { ", also after a restart" } else { "" };
+        show::line(&format!("{}: draining{kept}; owns {owned} loops", end.host))?;
+    } else {
+        let ready = if end.ready {
+            "ready for all"
+        } else {
+            "not ready for all yet"
+        };
+        show::line(&format!(
+            "{}: in service; holds {} loops, {ready}",
+            end.host, end.loops_held
+        ))?;
+    }
+    if end.draining && owned > 0 {
+        return Err(Error::Failed {
+            what: "draining",
+            source: format!(
+                "host {} still owns {owned} loops: no other host can take them, or their next cycle is yet to come; it goes on",
+                end.host
+            )
+            .into(),
+        });
+    }
+    Ok(())
+}
 
 /// Lists the hosts.
-pub(crate) fn list(client: &Client, json: bool) -> Result<(), Error> {
+fn list(client: &Client, json: bool) -> Result<(), Error> {
     let answer = client.get("/v1/hosts")?;
     if json {
         return show::json(&answer.text);
@@ -17,6 +86,7 @@ pub(crate) fn list(client: &Client, json: bool) -> Result<(), Error> {
     for host in hosts.hosts {
         let state = match (host.alive, host.draining) {
             (false, _) => "gone",
+            (true, true) if host.drain_kept => "draining, kept",
             (true, true) => "draining",
             (true, false) => "alive",
         };

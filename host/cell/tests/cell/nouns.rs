@@ -243,6 +243,8 @@ pub(crate) fn vitals(host: &HostId) -> Vitals {
         loops_owned: 54,
         loops_held: 55,
         draining: true,
+        drain_kept: false,
+        labels: vec![],
         version: "0.1.0".to_owned(),
     }
 }

@@ -34,6 +34,7 @@ pub(super) fn spec() -> LoopSpec {
         listens: vec![],
         fallback: None,
         fallback_parameters: BTreeMap::new(),
+        prefer: vec![],
         policy: Policy::default(),
     }
 }

@@ -60,6 +60,7 @@ fn setup() -> (LoopSpec, Wiring) {
         listens: vec![],
         fallback: None,
         fallback_parameters: BTreeMap::new(),
+        prefer: vec![],
         policy: Policy::default(),
     };
     let wiring = Wiring::new(&spec, &descriptor).unwrap();
@@ -325,4 +326,30 @@ proptest! {
         prop_assert!((0.0..=100.0).contains(&record.outputs[0]));
         prop_assert!(record.wanted[0].is_finite() && record.manual[0].is_finite());
     }
+}
+
+#[test]
+fn an_outage_or_a_date_that_was_set_is_no_time_to_control() {
+    let (spec, _) = setup();
+    let base = before();
+    let mut sample = sample(vec![]);
+    let day_ns = 86_400_000_000_000;
+    for (at_ns, dt) in [
+        (base.at_ns + spec.period_ns, spec.period_ns),
+        (base.at_ns + 5 * spec.period_ns, 5 * spec.period_ns),
+        (base.at_ns + 300 * day_ns, DT_PERIODS_MAX * spec.period_ns),
+        (5, 1),
+    ] {
+        sample.at_ns = at_ns;
+        assert_eq!(dt_ns(Some(&base), &spec, &sample), dt, "at {at_ns}");
+    }
+    // A period that was just made shorter: the last one was longer, and did last.
+    let mut faster = spec.clone();
+    faster.period_ns = spec.period_ns / 100;
+    sample.at_ns = base.at_ns + spec.period_ns;
+    let slow = Record {
+        dt_ns: spec.period_ns,
+        ..base
+    };
+    assert_eq!(dt_ns(Some(&slow), &faster, &sample), spec.period_ns);
 }

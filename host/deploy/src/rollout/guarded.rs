@@ -93,6 +93,7 @@ mod tests {
             listens: Vec::new(),
             fallback: None,
             fallback_parameters: BTreeMap::new(),
+            prefer: vec![],
             policy: Policy::default(),
         }
     }

@@ -28,7 +28,7 @@ use crate::{
     error::{Error, Words, chain},
     library::title,
     limits::{ROLLOUT_ERROR_PART, ROLLOUT_LOOPS_MAX, ROLLOUTS_KEPT_MAX, ROLLOUTS_RUNNING_MAX},
-    room::{Room, unix_ms},
+    room::Room,
     wire::{RolloutAsk, Told},
 };
 
@@ -237,7 +237,7 @@ impl Room {
             title: title(&info),
             digest: info.digest,
             parameters: draft.parameters,
-            started_at_unix_ms: unix_ms(),
+            started_at_unix_ms: self.clock.unix_ms(),
         };
         let rollout = Arc::new(Rollout::new(number, head, Course::new(draft.rule, legs), None));
         rollout.keep(self).await?;

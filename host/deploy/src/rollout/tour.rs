@@ -32,7 +32,7 @@ use crate::{
     error::Error,
     limits::{ANSWER_WAIT, APPLY_WAIT, ROLLOUT_ASK_FOR, ROLLOUT_ASK_PAUSE, ROLLOUT_LOOK_EVERY, ROLLOUT_WATCH_SLACK},
     plan,
-    room::{Room, every, unix_ms},
+    room::{Room, every},
     view::ApplyEnd,
     wire::{Amend, Ask, Roll, Told},
 };
@@ -123,7 +123,7 @@ impl Tour {
                 }
             }
             if course.ended() && ended_at_unix_ms.is_none() {
-                *ended_at_unix_ms = Some(unix_ms());
+                *ended_at_unix_ms = Some(self.room.clock.unix_ms());
                 self.kept = None;
             }
             self.kept.as_ref() != Some(&course.as_kept())

@@ -151,6 +151,7 @@ impl Cell {
             io,
             clock,
             field: Arc::clone(&field) as Arc<dyn bumpless_deploy::Field>,
+            labels: vec![],
             api: None,
             version: "test".to_owned(),
         })
@@ -247,6 +248,7 @@ pub(crate) fn draft(name: &str, component: &str, io: &str, number: u32) -> LoopD
         listens: Vec::new(),
         fallback: None,
         fallback_parameters: BTreeMap::new(),
+        prefer: Vec::new(),
         policy: Policy::default(),
     }
 }

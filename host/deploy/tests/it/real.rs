@@ -111,6 +111,7 @@ pub(crate) async fn host(cell: &Cell, dir: &std::path::Path) -> Real {
             control: true,
         },
         api: None,
+        labels: vec![],
         version: "test".to_owned(),
     })
     .unwrap();

@@ -265,6 +265,7 @@ impl Bench {
             listens: vec![],
             fallback: None,
             fallback_parameters: BTreeMap::new(),
+            prefer: vec![],
             policy: Policy {
                 probation_cycles: 30,
                 ..Policy::default()
@@ -309,6 +310,8 @@ impl Bench {
                     loops_owned: 0,
                     loops_held: 1,
                     draining: false,
+                    drain_kept: false,
+                    labels: vec![],
                     version: String::new(),
                 });
             }

@@ -42,6 +42,7 @@ pub(crate) fn spec(name: &str, setpoint: f64) -> LoopSpec {
         listens: vec!["alarms".into()],
         fallback: None,
         fallback_parameters: BTreeMap::new(),
+        prefer: vec![],
         policy: Policy::default(),
     }
 }

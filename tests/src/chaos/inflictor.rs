@@ -1,0 +1,352 @@
+//! Does to a cell what the schedule says, undoes it, and waits until all is well again.
+//!
+//! ```text
+//! fault ──► inflicted ──lasts──► undone ──► every host sees every other, every loop runs ──► a window: what, from, to
+//! ```
+//! Never: judges. Where a means is missing (no namespaces, no small disk), its kinds are said to be impossible.
+
+use std::time::Duration;
+
+use serde_json::{Value, json};
+
+use crate::{
+    Api, Cell, Error, HostProcess, PLANT,
+    chaos::{
+        operator::unix_ns,
+        relay::Way,
+        schedule::{Fault, Kind},
+    },
+    host_number, pause, wait_until,
+};
+
+/// Longest time until a cell is well after a fault: a lease, a restart, and a busy machine.
+const RECOVERY_MAX: Duration = Duration::from_secs(60);
+/// Longest time without a record in which a loop is said to run.
+const SILENCE_MS_MAX: u64 = 1_500;
+/// Longest wait for an answer while a cell recovers.
+const ANSWER_MAX: Duration = Duration::from_secs(5);
+/// Delays of a slow link, in ms, least and greatest.
+const DELAY_MS: (u64, u64) = (2, 60);
+/// Days that a date is moved by, at most.
+const DAYS_MAX: u64 = 300;
+
+/// A fault that was inflicted.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Window {
+    /// What.
+    pub kind: Kind,
+    /// When it began, in ns since 1970.
+    pub from_ns: u64,
+    /// When all was well again.
+    pub to_ns: u64,
+    /// For people: which hosts, for how long.
+    pub words: String,
+}
+
+/// A cell that gets hurt.
+#[derive(Debug)]
+pub struct Inflictor {
+    /// The cell.
+    pub cell: Cell,
+}
+
+impl Inflictor {
+    /// Can this kind be inflicted on this cell? If not, what is missing.
+    ///
+    /// # Errors
+    /// What is missing, in words.
+    pub fn possible(&self, kind: Kind) -> Result<(), &'static str> {
+        match kind {
+            Kind::Cut | Kind::CutOneWay if self.cell.net().is_none() && self.cell.relay.is_none() => {
+                Err("no network namespaces and no relay")
+            }
+            Kind::Delay | Kind::Loss if self.cell.relay.is_none() => Err("no relay"),
+            Kind::DiskFull if self.cell.disks.is_empty() => Err("no small disk"),
+            _ => Ok(()),
+        }
+    }
+
+    /// Inflicts a fault and waits until the cell is well again.
+    ///
+    /// # Errors
+    /// [`Error::Waited`] where it is not within a minute; what a host or a means says.
+    pub fn inflict(&mut self, fault: &Fault) -> Result<Window, Error> {
+        let from_ns = unix_ns();
+        let words = self.act(fault)?;
+        self.wait_well()?;
+        Ok(Window {
+            kind: fault.kind,
+            from_ns,
+            to_ns: unix_ns(),
+            words,
+        })
+    }
+
+    fn controller(&self, number: u64) -> String {
+        let controllers = &self.cell.controllers;
+        let place = usize::try_from(number % controllers.len().max(1) as u64).unwrap_or(0);
+        controllers.get(place).map(|host| host.name.clone()).unwrap_or_default()
+    }
+
+    fn act(&mut self, fault: &Fault) -> Result<String, Error> {
+        let lasts = Duration::from_millis(fault.lasts_ms);
+        let victim = self.controller(fault.victim);
+        match fault.kind {
+            Kind::Kill => {
+                self.cell.host(&victim)?.kill9();
+                pause(lasts);
+                self.cell.restart(&victim)?;
+                Ok(format!("{victim}, away for {lasts:?} and its start"))
+            }
+            Kind::Pause => {
+                self.cell.host(&victim)?.pause()?;
+                pause(lasts);
+                self.cell.host(&victim)?.resume()?;
+                Ok(format!("{victim}, for {lasts:?}"))
+            }
+            Kind::Cut | Kind::CutOneWay => self.cut(fault, lasts),
+            Kind::Delay => {
+                let (low, high) = DELAY_MS;
+                let delay = Duration::from_millis(low + fault.choice % (high - low));
+                self.slow(delay);
+                pause(lasts);
+                self.slow(Duration::ZERO);
+                Ok(format!(
+                    "{delay:?} each way between {PLANT} and {}, for {lasts:?}",
+                    self.relayed()
+                ))
+            }
+            Kind::Loss => Ok(self.lose(fault, lasts)),
+            Kind::DiskFull => {
+                let names: Vec<String> = self.cell.disks.keys().cloned().collect();
+                let place = usize::try_from(fault.choice % names.len().max(1) as u64).unwrap_or(0);
+                let host = names.get(place).cloned().unwrap_or_default();
+                if let Some(disk) = self.cell.disks.get(&host) {
+                    disk.fill()?;
+                    pause(lasts);
+                    disk.free()?;
+                }
+                if !self.cell.host(&host)?.is_running() {
+                    return Err(Error::NoHost(format!("host {host} ended because its disk was full")));
+                }
+                Ok(format!("of {host}, for {lasts:?}"))
+            }
+            Kind::Date => {
+                let days = move_date(self.cell.host(&victim)?, fault.choice);
+                self.cell.host(&victim)?.terminate()?;
+                pause(lasts);
+                self.cell.restart(&victim)?;
+                Ok(format!("{victim} comes back with its date {days} days off"))
+            }
+            Kind::Drain => {
+                let api = self.cell.api()?;
+                let end = api.post(&format!("/v1/hosts/{victim}/drain"), &json!({}))?;
+                pause(lasts);
+                api.post(&format!("/v1/hosts/{victim}/undrain"), &json!({}))?;
+                Ok(format!(
+                    "{victim}, empty for {lasts:?}; it owned {} when told so",
+                    end["loops_owned"]
+                ))
+            }
+            Kind::Stop => {
+                self.cell.host(&victim)?.terminate()?;
+                pause(lasts);
+                self.cell.restart(&victim)?;
+                Ok(format!("{victim}, away for {lasts:?} and its start"))
+            }
+            Kind::HomeKill => {
+                let days = move_date(&mut self.cell.plant, fault.choice);
+                self.cell.plant.kill9();
+                pause(lasts);
+                self.cell.restart(PLANT)?;
+                Ok(format!("away for {lasts:?} and its start; its date is {days} days off"))
+            }
+            Kind::HomePause => {
+                self.cell.plant.pause()?;
+                pause(lasts);
+                self.cell.plant.resume()?;
+                Ok(format!("for {lasts:?}"))
+            }
+            Kind::Together => {
+                let frozen = self.controller(fault.victim + 1);
+                self.slow(Duration::from_millis(DELAY_MS.1));
+                self.cell.host(&frozen)?.pause()?;
+                self.cell.host(&victim)?.kill9();
+                pause(lasts);
+                self.cell.host(&frozen)?.resume()?;
+                self.slow(Duration::ZERO);
+                self.cell.restart(&victim)?;
+                Ok(format!(
+                    "{victim} killed, {frozen} stopped for {lasts:?}, {} far away",
+                    self.relayed()
+                ))
+            }
+            Kind::AllDead => {
+                for host in self.cell.hosts_mut() {
+                    host.kill9();
+                }
+                pause(lasts);
+                let names: Vec<String> = self.cell.hosts().map(|host| host.name.clone()).collect();
+                for name in &names {
+                    self.cell.restart(name)?;
+                }
+                Ok(format!("for {lasts:?} and their starts"))
+            }
+        }
+    }
+
+    fn relayed(&self) -> &str {
+        self.cell.relayed().unwrap_or("nobody")
+    }
+
+    fn slow(&self, delay: Duration) {
+        if let Some(relay) = &self.cell.relay {
+            relay.delay(Way::Away, delay);
+            relay.delay(Way::Back, delay);
+        }
+    }
+
+    /// Stalls as TCP has them where packets are lost: a fifth of a second until it is sent again, twice that the second time.
+    fn lose(&self, fault: &Fault, lasts: Duration) -> String {
+        let Some(relay) = &self.cell.relay else {
+            return String::new();
+        };
+        let started = std::time::Instant::now();
+        let (mut stalls, mut draw) = (0_u64, fault.choice);
+        while started.elapsed() < lasts {
+            draw = draw
+                .wrapping_mul(6_364_136_223_846_793_005)
+                .wrapping_add(1_442_695_040_888_963_407);
+            let way = if draw >> 63 == 0 { Way::Away } else { Way::Back };
+            relay.stall(way, true);
+            pause(Duration::from_millis(if draw >> 60 & 1 == 0 { 200 } else { 400 }));
+            relay.stall(way, false);
+            stalls += 1;
+            if stalls == 3 {
+                relay.reset();
+            }
+            pause(Duration::from_millis(20 + (draw >> 40) % 280));
+        }
+        format!(
+            "{stalls} stalls and {} break between {PLANT} and {}",
+            u64::from(stalls >= 3),
+            self.relayed()
+        )
+    }
+
+    fn cut(&self, fault: &Fault, lasts: Duration) -> Result<String, Error> {
+        let one_way = fault.kind == Kind::CutOneWay;
+        let (victim, others) = match self.cell.net() {
+            None => (self.relayed().to_owned(), vec![PLANT.to_owned()]),
+            Some(_) => {
+                let victim = self.controller(fault.victim);
+                let others = match fault.choice % 3 {
+                    0 => vec![PLANT.to_owned()],
+                    1 => vec![self.controller(fault.victim + 1)],
+                    _ => self.cell.hosts().map(|host| host.name.clone()).collect(),
+                };
+                (victim, others)
+            }
+        };
+        let outwards = fault.choice / 3 % 2 == 0;
+        let mut pairs = Vec::new();
+        for other in others.iter().filter(|other| **other != victim) {
+            if !one_way || outwards {
+                pairs.push((victim.clone(), other.clone()));
+            }
+            if !one_way || !outwards {
+                pairs.push((other.clone(), victim.clone()));
+            }
+        }
+        for (from, to) in &pairs {
+            self.block(from, to, true)?;
+        }
+        pause(lasts);
+        for (from, to) in &pairs {
+            self.block(from, to, false)?;
+        }
+        let word = match (one_way, outwards) {
+            (false, _) => "and",
+            (true, true) => "to",
+            (true, false) => "from",
+        };
+        let others: Vec<&str> = others
+            .iter()
+            .map(String::as_str)
+            .filter(|other| *other != victim)
+            .collect();
+        Ok(format!("{victim} {word} {}, for {lasts:?}", others.join(", ")))
+    }
+
+    /// Blocks what goes from one host to another, or lets it pass again. Of the relayed pair the relay does it.
+    fn block(&self, from: &str, to: &str, blocked: bool) -> Result<(), Error> {
+        let relayed = self.cell.relayed().unwrap_or_default();
+        match (&self.cell.relay, self.cell.net()) {
+            (Some(relay), _) if from == relayed && to == PLANT => {
+                relay.stall(Way::Away, blocked);
+                Ok(())
+            }
+            (Some(relay), _) if from == PLANT && to == relayed => {
+                relay.stall(Way::Back, blocked);
+                Ok(())
+            }
+            (_, Some(net)) if blocked => net.cut(host_number(from), host_number(to)),
+            (_, Some(net)) => net.heal(host_number(from), host_number(to)),
+            _ => Ok(()),
+        }
+    }
+
+    /// Waits until every host sees every other one, and every loop has an owner and a new record.
+    ///
+    /// # Errors
+    /// [`Error::Waited`] with what is missing.
+    pub fn wait_well(&mut self) -> Result<(), Error> {
+        let addresses: Vec<(String, String)> = self
+            .cell
+            .hosts()
+            .map(|host| (host.name.clone(), host.api.clone()))
+            .collect();
+        let all = addresses.len();
+        let hosts_see = |(name, address): &(String, String)| -> Result<(), String> {
+            let api = Api::within(address.clone(), ANSWER_MAX);
+            let hosts = api.hosts().map_err(|error| format!("{name}: {error}"))?;
+            let alive = hosts.iter().filter(|host| host["alive"] == true).count();
+            if alive == all {
+                Ok(())
+            } else {
+                Err(format!("{name} sees {alive} hosts of {all}"))
+            }
+        };
+        wait_until("all hosts to see each other after a fault", RECOVERY_MAX, || {
+            addresses.iter().try_for_each(hosts_see)
+        })?;
+        let api = Api::within(self.cell.plant.api.clone(), ANSWER_MAX);
+        wait_until("all loops to run after a fault", RECOVERY_MAX, || {
+            let loops = api.get("/v1/loops").map_err(|error| error.to_string())?;
+            let rows = loops["loops"].as_array().map(Vec::as_slice).unwrap_or_default();
+            match rows.iter().find(|row| !runs(row)) {
+                Some(row) => Err(format!(
+                    "{}: owner {}, members {}, last record {} ms ago, {}",
+                    row["name"], row["owner"], row["members"], row["last_age_ms"], row["failures"]
+                )),
+                None => Ok(()),
+            }
+        })
+    }
+}
+
+/// Has the loop an owner, all its members, and a record of now?
+fn runs(row: &Value) -> bool {
+    let members = row["members"].as_array().map_or(0, Vec::len) as u64;
+    let wanted = row["spec"]["replicas"].as_u64().unwrap_or(1);
+    row["owner"].is_string()
+        && members >= wanted
+        && row["last_age_ms"].as_u64().is_some_and(|age| age <= SILENCE_MS_MAX)
+}
+
+/// Moves a host's date by whole days from its next start on; gives the days.
+fn move_date(host: &mut HostProcess, choice: u64) -> i64 {
+    let days = i64::try_from(choice % (2 * DAYS_MAX + 1)).unwrap_or(0) - i64::try_from(DAYS_MAX).unwrap_or(0);
+    host.set_head(format!("clock_offset_s = {}\n", days * 86_400));
+    days
+}
