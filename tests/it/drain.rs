@@ -7,14 +7,14 @@ use serde_json::{Value, json};
 
 use crate::{names, one_writer, text, whole};
 
-/// Three loops of some hertz on a cell of so many controllers; each loop on all of them.
+/// Three slow loops, so that a busy machine costs no cycle, on a cell of so many controllers; each loop on all of them.
 fn running_cell(controllers: usize, change: impl Fn(usize, &mut Value)) -> Cell {
     let options = CellOptions::first_order("{ count = 3, tau_s = 1.0 }").controllers(controllers);
     let mut cell = Cell::start(options).unwrap();
     let api = cell.api().unwrap();
     api.upload_stock(&["pid"]).unwrap();
     for n in 0..3 {
-        let mut draft = first_order_loop(n, "pid", 100.0);
+        let mut draft = first_order_loop(n, "pid", 500.0);
         draft["replicas"] = json!(controllers);
         change(n, &mut draft);
         api.apply(&draft).unwrap();
