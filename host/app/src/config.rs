@@ -33,10 +33,11 @@ use std::{
     time::Duration,
 };
 
-use bumpless_core::{CellName, HostId, limits::HOST_LABELS_MAX};
+use bumpless_core::{CellName, HostId};
 use bumpless_io::BusConfig;
 use serde::{Deserialize, Serialize};
 
+mod itself;
 mod testing;
 
 use crate::{error::Error, realtime::Realtime};
@@ -44,9 +45,6 @@ use testing::TestingTable;
 
 /// Bytes of a configuration file: thousands of points fit; a mistaken path to a large file does not.
 const FILE_BYTES_MAX: u64 = 16 * 1024 * 1024;
-
-/// Furthest that a drill moves the date, in s: a year.
-const CLOCK_OFFSET_S_MAX: u64 = 366 * 86_400;
 
 /// Everything that a host is told, checked as far as text can be.
 #[derive(Debug, Clone)]
@@ -268,22 +266,7 @@ impl File {
         }
         cell.check().map_err(|error| wrong("cell", error.to_string()))?;
 
-        if self.labels.len() > HOST_LABELS_MAX {
-            return Err(wrong("labels", format!("a host has at most {HOST_LABELS_MAX} labels")));
-        }
-        if let Some(bad) = self.labels.iter().find(|label| HostId::new(label).is_err()) {
-            let reason = format!("{bad:?} is no label; use lower-case letters, digits, '-', '_' and '.'");
-            return Err(wrong("labels", reason));
-        }
-        if self.clock_offset_s.unsigned_abs() > CLOCK_OFFSET_S_MAX {
-            return Err(wrong(
-                "clock_offset_s",
-                format!(
-                    "{} is more than {CLOCK_OFFSET_S_MAX} s, a year, either way",
-                    self.clock_offset_s
-                ),
-            ));
-        }
+        itself::check(&self.labels, self.clock_offset_s, &wrong)?;
         let mut ids = std::collections::HashSet::new();
         if let Some(twice) = self.bus.iter().find(|bus| !ids.insert(bus.id())) {
             return Err(wrong(
