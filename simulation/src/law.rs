@@ -122,6 +122,7 @@ pub(crate) fn spec(number: u32, revision: u64) -> LoopSpec {
         listens: Vec::new(),
         fallback: None,
         fallback_parameters: BTreeMap::new(),
+        prefer: Vec::new(),
         policy: Policy {
             // One that errs must never be the last that votes.
             on_fewer: OnFewer::Fault,

@@ -93,8 +93,8 @@ impl World {
             let ranked = if law::is_alone(number) {
                 vec![home]
             } else {
-                let members = place::members(&loop_id(number), &all, HOLDERS);
-                members.iter().map(law::host_number).collect()
+                let members = place::rank(&loop_id(number), &all);
+                members.iter().take(HOLDERS).map(law::host_number).collect()
             };
             for (rank, host) in ranked.iter().enumerate() {
                 let host = self.host_mut(*host);

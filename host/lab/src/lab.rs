@@ -459,6 +459,7 @@ impl Lab {
             listens: Vec::new(),
             fallback: None,
             fallback_parameters: std::collections::BTreeMap::new(),
+            prefer: Vec::new(),
             policy: plan.policy,
         };
         spec.check().map_err(|e| wrong(e.to_string()))?;
