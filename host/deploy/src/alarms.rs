@@ -220,7 +220,7 @@ impl Room {
             AlarmAct::Shelve { seconds, reason } => {
                 let until_ns = now_ns.saturating_add((seconds.max(0.0) * 1e9) as u64);
                 let by = by.to_owned();
-                board.shelve(alarm, Shelf { until_ns, by, reason }, now_ns)
+                board.shelve(alarm, &Shelf { until_ns, by, reason }, now_ns)
             }
             AlarmAct::Unshelve => board.unshelve(alarm, by, now_ns),
             AlarmAct::TakeOut { reason } => board.service(alarm, Some(&reason), by, now_ns),

@@ -34,7 +34,7 @@ pub(super) fn alarms() -> Vec<AlarmView> {
         by: "ann".into(),
         reason: "known".into(),
     };
-    board.shelve("overrun", shelf, 2_000_000_000).expect("good");
+    board.shelve("overrun", &shelf, 2_000_000_000).expect("good");
     board
         .all()
         .map(|standing| AlarmView {

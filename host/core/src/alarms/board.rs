@@ -383,7 +383,7 @@ impl Board {
     ///
     /// # Errors
     /// [`AlarmError::Unknown`]; [`AlarmError::Shelve`] without a reason, or for longer than a shift.
-    pub fn shelve(&mut self, name: &str, shelf: Shelf, at_ns: u64) -> Result<Change, AlarmError> {
+    pub fn shelve(&mut self, name: &str, shelf: &Shelf, at_ns: u64) -> Result<Change, AlarmError> {
         let alarm = self.known(name)?;
         let lasts_ns = shelf.until_ns.saturating_sub(at_ns);
         if shelf.reason.trim().is_empty() || !(1_000_000_000..=SHELVE_NS_MAX).contains(&lasts_ns) {

@@ -209,13 +209,13 @@ fn shelved_suppressed_and_out_of_service_are_quiet_and_go_on_living() {
         by: "ann".to_owned(),
         reason: reason.to_owned(),
     };
-    assert!(board.shelve("low", shelf(20, " "), S).is_err(), "why?");
-    assert!(board.shelve("low", shelf(1, "x"), S).is_err(), "for how long?");
+    assert!(board.shelve("low", &shelf(20, " "), S).is_err(), "why?");
+    assert!(board.shelve("low", &shelf(1, "x"), S).is_err(), "for how long?");
     assert!(
-        board.shelve("low", shelf(60 * 60 * 13, "x"), S).is_err(),
+        board.shelve("low", &shelf(60 * 60 * 13, "x"), S).is_err(),
         "longer than a shift"
     );
-    board.shelve("low", shelf(20, "sensor is being cleaned"), S).unwrap();
+    board.shelve("low", &shelf(20, "sensor is being cleaned"), S).unwrap();
     assert_eq!(see(&mut board, 2, 5.0), came("low"));
     assert!(board.get("low").unwrap().is_quiet());
     assert_eq!(board.flood(3 * S).comings, 0, "nobody was told");
