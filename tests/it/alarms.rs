@@ -63,7 +63,7 @@ fn an_alarm_lives_by_the_process_and_by_people_and_outlives_its_host() {
         .into_iter()
         .flatten()
         .map(|alarm| text(&alarm["name"]));
-    assert!(!names.into_iter().any(|name| name == "high"), "{standing}");
+    assert!(!names.any(|name| name == "high"), "{standing}");
     let seen = json!({ "act": "acknowledge", "by": "ann", "note": "known" });
     assert_eq!(api.post(&path, &seen).unwrap()["state"], "acknowledged");
     let again = api.post(&path, &seen).unwrap_err().to_string();
@@ -83,7 +83,7 @@ fn an_alarm_lives_by_the_process_and_by_people_and_outlives_its_host() {
     let reset = api.post(&path, &json!({ "act": "reset", "by": "ann" })).unwrap();
     assert_eq!(reset["state"], "normal");
     let past = api.get(&format!("/v1/alarms/history?loop={LOOP}")).unwrap();
-    let what: Vec<&str> = past["changes"]
+    let what: Vec<String> = past["changes"]
         .as_array()
         .into_iter()
         .flatten()

@@ -98,7 +98,11 @@ fn pid(draw: &mut Draw, n: u32) -> Value {
     let (dt_s, cycles) = (0.02, 4000);
     let t1 = draw.between(4.0, 10.0);
     // Every second one without a derivative.
-    let t2 = if n % 2 == 0 { 0.0 } else { draw.between(0.5, 2.0) };
+    let t2 = if n.is_multiple_of(2) {
+        0.0
+    } else {
+        draw.between(0.5, 2.0)
+    };
     let delay_s = draw.on_grid(0.0, 3.0, dt_s);
     let mut plant = Plant::resting(draw.between(0.5, 3.0), [t1, t2], delay_s, dt_s, BASE);
     let mut given = simc(&plant, draw);
@@ -317,7 +321,7 @@ fn autotune(draw: &mut Draw, n: u32) -> Value {
 
 fn mpc(draw: &mut Draw, n: u32) -> Value {
     let dt_s = 0.5;
-    let gain = draw.between(0.5, 2.0) * if n % 2 == 0 { 1.0 } else { -1.0 };
+    let gain = draw.between(0.5, 2.0) * if n.is_multiple_of(2) { 1.0 } else { -1.0 };
     let (lag, delay) = (draw.between(4.0, 10.0), draw.between(0.0, 8.0).round());
     let mut given = vec![
         ("gain", gain),

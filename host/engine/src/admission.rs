@@ -128,7 +128,7 @@ fn check_interface(component: &Component, export: &str, functions: &[&str]) -> R
     };
     for function in functions {
         if !matches!(
-            instance.get_export(engine, *function).map(|e| e.ty),
+            instance.get_export(engine, function).map(|e| e.ty),
             Some(ComponentItem::ComponentFunc(_))
         ) {
             return world(format!("its export {export} lacks the function {function}"));

@@ -27,6 +27,10 @@ const MINIMUM_PHASE: Setting = Setting {
     relative_gain: 1.40,
 };
 
+#[allow(
+    clippy::approx_constant,
+    reason = "a pump's constant of the paper, which happens to look like π"
+)]
 const NON_MINIMUM_PHASE: Setting = Setting {
     gamma: [0.43, 0.34],
     k: [3.14, 3.29],
