@@ -10,10 +10,12 @@ mod chaos;
 mod chaos_report;
 mod conditions;
 mod delay;
+mod devices;
 mod error;
 mod failover;
 mod faults;
 mod history;
+mod io;
 mod kills;
 mod lab;
 mod law;
@@ -80,6 +82,14 @@ enum Bench {
     Lab,
     /// A step native and in the sandbox, and the cycle of a loop whose owner, replica and I/O are one process.
     Step,
+    /// 1,000 points on ten Modbus devices at 10 Hz: requests, staleness, processor time; and one device that is slow.
+    Io,
+    /// The other process of `io`.
+    #[command(hide = true)]
+    IoDevices {
+        /// How many devices.
+        count: u16,
+    },
     /// The other process of `call`.
     #[command(hide = true)]
     CallPeer {
@@ -148,6 +158,8 @@ fn run(bench: &Bench, options: Options) -> Result<bool, Error> {
         Bench::Step => "step",
         Bench::Upload => "upload",
         Bench::Page(_) => "page",
+        Bench::Io => "io",
+        Bench::IoDevices { count } => return devices::run(*count).map(|()| true),
         Bench::Burn { core } => return stress::burn(*core).map(|()| true),
         Bench::CallPeer { component } => return peer::run(component).map(|()| true),
     };
@@ -166,7 +178,8 @@ fn run(bench: &Bench, options: Options) -> Result<bool, Error> {
         Bench::Step => step::run(options, &mut report)?,
         Bench::Upload => upload::run(options, &mut report)?,
         Bench::Page(watching) => page::run(options, *watching, &mut report)?,
-        Bench::CallPeer { .. } | Bench::Burn { .. } => {}
+        Bench::Io => io::run(options, &mut report)?,
+        Bench::CallPeer { .. } | Bench::Burn { .. } | Bench::IoDevices { .. } => {}
     }
     Ok(report.end())
 }

@@ -16,7 +16,7 @@ use serde_json::Value;
 const LINES_MAX: usize = 600;
 
 /// What each room may use of the others. Nothing imports upwards; `io engine store cell` never import each other.
-const ROOMS: [(&str, &[&str]); 34] = [
+const ROOMS: [(&str, &[&str]); 35] = [
     ("bumpless-core", &[]),
     ("bumpless-io", &["bumpless-core"]),
     ("bumpless-engine", &["bumpless-core"]),
@@ -39,6 +39,7 @@ const ROOMS: [(&str, &[&str]); 34] = [
     ),
     ("bumpless-api", &["bumpless-core", "bumpless-deploy"]),
     ("bumpless-lab", &["bumpless-core", "bumpless-io", "bumpless-engine"]),
+    ("bumpless-scada", &["bumpless-core", "bumpless-io", "bumpless-deploy"]),
     (
         "bumpless-app",
         &[
@@ -51,6 +52,7 @@ const ROOMS: [(&str, &[&str]); 34] = [
             "bumpless-deploy",
             "bumpless-api",
             "bumpless-lab",
+            "bumpless-scada",
         ],
     ),
     ("bumpless-sdk", &[]),
@@ -101,6 +103,7 @@ const CONFINED: [(&str, &[&str]); 11] = [
             "bumpless-cell",
             "bumpless-deploy",
             "bumpless-api",
+            "bumpless-scada",
             "bumpless-app",
             "bumpless-bench",
         ],

@@ -14,6 +14,7 @@
 //! | refusals | bad components, loops, requests, configurations, command lines |
 //! | votes | a host whose steps come out wrong, and who notices |
 //! | modbus | a real Modbus device that dies and comes back |
+//! | scada | the cell as a Modbus device: points of another host, commands to a loop |
 //! | neighbours | two cells on one machine |
 //! | watching | metrics, the document of the API, the live feed |
 //! | library | trials, labels, bundles, bombs and crowds of components |
@@ -45,6 +46,7 @@ mod neighbours;
 mod refusals;
 mod restarts;
 mod rollouts;
+mod scada;
 mod stock;
 mod story;
 mod votes;

@@ -1,8 +1,8 @@
 //! Builds a host's rooms from the bottom up, wires their outlets, and takes them down from the top.
 //!
 //! ```text
-//! clock, store, engine, io ─► bus ─► loops ─► deploy ─► api        (start)
-//! api ─► deploy drains ─► loops ─► io ─► bus ─► record writer      (stop)
+//! clock, store, engine, io ─► bus ─► loops ─► deploy ─► api, scada (start)
+//! scada ─► api ─► deploy drains ─► loops ─► io ─► bus ─► record writer      (stop)
 //! ```
 //! Never: decides anything else. What arrives before loops and deployment exist waits in a bounded list.
 
@@ -19,6 +19,7 @@ use bumpless_engine::Engine;
 use bumpless_io::{Clock, IoServer};
 use bumpless_lab::Library;
 use bumpless_loops::{Loops, LoopsEvent};
+use bumpless_scada::Servers;
 use bumpless_store::{CycleLog, RecordWriter, Store};
 use tokio::{
     net::TcpListener,
@@ -46,6 +47,7 @@ pub struct Running {
     session: Session,
     stop_api: watch::Sender<bool>,
     api_task: JoinHandle<Result<(), bumpless_api::Error>>,
+    modbus_servers: Servers,
     failures: mpsc::Receiver<Error>,
 }
 
@@ -205,6 +207,9 @@ pub async fn run(config: Config, faults: Option<mpsc::Sender<Fault>>) -> Result<
     drop(outlets.deploy.set(deploy.clone()));
     outlets.open();
 
+    let modbus_servers = bumpless_scada::start(&config.modbus_servers, &deploy, env!("CARGO_PKG_VERSION"))
+        .await
+        .map_err(|e| Error::start("the Modbus servers", e))?;
     let (stop_api, mut stopping) = watch::channel(false);
     let stopped = async move {
         // An error means that the sender is gone, and so is the host.
@@ -223,6 +228,7 @@ pub async fn run(config: Config, faults: Option<mpsc::Sender<Fault>>) -> Result<
         session,
         stop_api,
         api_task,
+        modbus_servers,
         failures,
     })
 }
@@ -246,6 +252,7 @@ impl Running {
 
     /// Leaves the cell in order: hands its loops to others, then stops every room.
     pub async fn stop(self) {
+        self.modbus_servers.stop().await;
         self.deploy.shutdown().await;
         self.stop_api.send_replace(true);
         if !self.api_task.is_finished() {

@@ -24,6 +24,14 @@
 //! [[bus]]                          # points, if this host serves any
 //! id = "plant"
 //! driver = "sim"
+//!
+//! [[modbus_server]]                # points and loops of the cell, for SCADA
+//! listen = "127.0.0.1:1502"
+//! [[modbus_server.map]]
+//! table = "input"
+//! address = 0
+//! point = "plant.pit129"
+//! type = "f32"
 //! ```
 //! Relative paths count from the folder of the file. Never: opens anything but the file.
 
@@ -35,6 +43,7 @@ use std::{
 
 use bumpless_core::{CellName, HostId};
 use bumpless_io::BusConfig;
+use bumpless_scada::ModbusServerConfig;
 use serde::{Deserialize, Serialize};
 
 mod itself;
@@ -77,6 +86,8 @@ pub struct Config {
     pub loops: bumpless_loops::Config,
     /// Bytes on disk for recorded cycles; none to record none.
     pub history_bytes_max: Option<u64>,
+    /// Points and loops of the cell as Modbus registers.
+    pub modbus_servers: Vec<ModbusServerConfig>,
 }
 
 /// The file.
@@ -108,6 +119,8 @@ pub(crate) struct File {
     history: HistoryTable,
     #[serde(default, skip_serializing_if = "TestingTable::is_empty")]
     testing: TestingTable,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    modbus_server: Vec<ModbusServerConfig>,
 }
 
 fn data_default() -> PathBuf {
@@ -276,9 +289,17 @@ impl File {
         }
         let mut buses = bumpless_io::Config { buses: self.bus };
         for bus in &mut buses.buses {
-            if let BusConfig::Sim(sim) = bus {
-                sim.journal = sim.journal.take().map(|journal| folder.join(journal));
+            match bus {
+                BusConfig::Sim(sim) => sim.journal = sim.journal.take().map(|journal| folder.join(journal)),
+                BusConfig::ModbusTcp(modbus) | BusConfig::ModbusRtu(modbus) => modbus.resolve(folder),
             }
+        }
+        let mut modbus_servers = self.modbus_server;
+        for server in &mut modbus_servers {
+            server.resolve(folder);
+            server
+                .check()
+                .map_err(|error| wrong("modbus_server", error.to_string()))?;
         }
         let has_buses = !buses.buses.is_empty();
         let io = self.roles.io.unwrap_or(has_buses);
@@ -316,6 +337,7 @@ impl File {
             engine: self.engine.checked(&wrong)?,
             loops,
             history_bytes_max: self.history.checked(&wrong)?,
+            modbus_servers,
         })
     }
 }

@@ -40,6 +40,8 @@ impl Room {
                     let here = |point| self.io.as_ref().is_some_and(|io| io.index(point).is_some());
                     Ok(Told::Found(points.iter().map(here).collect()))
                 }
+                Ask::Put(point, value, by) => self.put_here(&point, value, &by).map(|()| Told::Done),
+                Ask::Read(points) => Ok(self.read_here(&points)),
                 Ask::Points(first) => Ok(self.points_here(first)),
                 Ask::Bytes(digest) => {
                     let _place = self.sending.acquire().await.map_err(|_| stopping())?;

@@ -30,6 +30,7 @@ use crate::{
 
 mod alarms;
 mod past;
+mod points;
 mod rollouts;
 
 /// One host's part in the cell. Clones share it. It lives until [`Deploy::shutdown`].

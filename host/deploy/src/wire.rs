@@ -7,7 +7,7 @@
 use std::collections::BTreeMap;
 
 use bumpless_core::{
-    Command, ComponentInfo, Digest, Edition, HostId, Intent, LoopId, LoopSpec, PointId, Record, alarms::Flood,
+    Command, ComponentInfo, Digest, Edition, HostId, Intent, LoopId, LoopSpec, PointId, Reading, Record, alarms::Flood,
 };
 use bumpless_store::{Tombstone, Window};
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
@@ -86,6 +86,10 @@ pub(crate) enum Ask {
     Rollout(RolloutAsk),
     /// About the alarms of loops at home there.
     Alarm(AlarmAsk),
+    /// To an I/O host: these points now, at most a page of them.
+    Read(Vec<PointId>),
+    /// To an I/O host: a value for a point that no loop writes, and who wants it.
+    Put(PointId, f64, String),
 }
 
 /// What may be asked about alarms.
@@ -208,6 +212,8 @@ pub(crate) enum Told {
     Alarms(Vec<AlarmView>, Flood),
     /// What happened to alarms.
     AlarmPast(Vec<AlarmEvent>),
+    /// Readings in the order asked, with the age of each value in ns; none for points that are not here.
+    Read(Vec<Option<(Reading, u64)>>),
     /// A component's bytes. Never written by serde: see [`encode_reply`].
     #[serde(skip)]
     Bytes(Vec<u8>),

@@ -149,6 +149,12 @@ impl ValueType {
             Self::F32 => u64::from((held as f32).to_bits()),
             Self::F64 => held.to_bits(),
         };
+        self.lay_out(bits, word_order, byte_order)
+    }
+
+    /// Bits as registers in the order of the wire.
+    #[must_use]
+    pub fn lay_out(self, bits: u64, word_order: WordOrder, byte_order: ByteOrder) -> Words {
         let count = usize::from(self.words());
         let mut words = [0; WORDS_MAX];
         for (position, word) in words.iter_mut().take(count).enumerate() {

@@ -11,6 +11,7 @@
 mod errands;
 mod peer;
 mod scan;
+mod transports;
 
 use std::{
     net::SocketAddr,

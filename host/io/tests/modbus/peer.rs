@@ -38,6 +38,12 @@ pub(crate) enum Manner {
     Short,
     /// With bytes that are no Modbus.
     Garbage,
+    /// As it should, in the frames of a serial line.
+    Rtu,
+    /// As it should, without function 22.
+    WithoutMask,
+    /// Confirms writes and does nothing.
+    Forgets,
 }
 
 /// What the device holds, and how it behaves.
@@ -153,6 +159,22 @@ fn serve(mut stream: TcpStream, device: &Mutex<Device>, ending: &AtomicBool, wri
             Err(e) if matches!(e.kind(), std::io::ErrorKind::WouldBlock | std::io::ErrorKind::TimedOut) => continue,
             Err(_) => return,
         }
+        if device.lock().expect("device").manner == Manner::Rtu {
+            // Requests of 8 bytes only: reads, and functions 5 and 6.
+            while buffer.len() >= 8 {
+                let frame: Vec<u8> = buffer.drain(..8).collect();
+                let pdu = &frame[1..6];
+                if matches!(pdu[0], 5 | 6) {
+                    let _ = writes.send((frame[0], pdu.to_vec()));
+                }
+                let answer = answered(&mut device.lock().expect("device"), pdu);
+                let frame = bumpless_io::modbus::frame::with_checksum(frame[0], &answer);
+                if stream.write_all(&frame).is_err() {
+                    return;
+                }
+            }
+            continue;
+        }
         while buffer.len() >= 7 {
             let length = usize::from(u16::from_be_bytes([buffer[4], buffer[5]]));
             if buffer.len() < 6 + length {
@@ -162,18 +184,20 @@ fn serve(mut stream: TcpStream, device: &Mutex<Device>, ending: &AtomicBool, wri
             let (unit, pdu) = (frame[6], &frame[7..]);
             let mut device = device.lock().expect("device");
             let manner = device.manner;
-            let is_write = matches!(pdu[0], 5 | 6 | 15 | 16);
+            let is_write = matches!(pdu[0], 5 | 6 | 15 | 16 | 22 | 23);
             let mut answer = match manner {
                 Manner::Silent => continue,
                 Manner::SilentUnit(quiet) if quiet == unit => continue,
                 Manner::Closes => return,
                 Manner::Exception(code) => vec![pdu[0] | 0x80, code],
                 Manner::WriteException(code) if is_write => vec![pdu[0] | 0x80, code],
+                Manner::WithoutMask if pdu[0] == 22 => vec![pdu[0] | 0x80, 1],
+                Manner::Forgets if matches!(pdu[0], 5 | 6 | 15 | 16) => pdu[..5].to_vec(),
                 Manner::RefusesGaps if !is_write && u16::from_be_bytes([pdu[3], pdu[4]]) > 2 => vec![pdu[0] | 0x80, 2],
                 _ => answered(&mut device, pdu),
             };
             drop(device);
-            if is_write {
+            if is_write && !(manner == Manner::WithoutMask && pdu[0] == 22) {
                 let _ = writes.send((unit, pdu.to_vec()));
             }
             if manner == Manner::Short && !is_write {
@@ -243,6 +267,11 @@ fn answered(device: &mut Device, pdu: &[u8]) -> Vec<u8> {
                 device.words[start + n] = u16::from_be_bytes([pdu[6 + 2 * n], pdu[7 + 2 * n]]);
             }
             pdu[..5].to_vec()
+        }
+        22 => {
+            let or = u16::from_be_bytes([pdu[5], pdu[6]]);
+            device.words[start] = (device.words[start] & second) | (or & !second);
+            pdu.to_vec()
         }
         function => vec![function | 0x80, 1],
     }

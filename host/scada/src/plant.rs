@@ -1,0 +1,67 @@
+//! What a server asks of the cell, as a trait: its answers are tested against a cell that exists only in memory.
+//!
+//! Never: adds a decision; [`Deploy`] is the only implementation outside of tests.
+
+use std::{future::Future, pin::Pin, sync::Arc, time::Duration};
+
+use bumpless_core::{CommandBody, LoopId, Mode, PointId, Reading, Record};
+use bumpless_deploy::{Deploy, Error};
+
+/// An answer that comes later. It owns what it needs, so that it ends even where the asker has left.
+pub(crate) type Later<T> = Pin<Box<dyn Future<Output = T> + Send>>;
+
+/// A reading, and how old it was when it was looked at.
+pub(crate) type Aged = (Reading, Duration);
+
+/// The cell, as far as a server needs it.
+pub(crate) trait Plant: Send + Sync + 'static {
+    /// A point of this host, now; none where another host has it.
+    fn point_here(&self, point: &PointId) -> Option<Aged>;
+    /// A loop's last record, and how long ago it came here.
+    fn last(&self, id: &LoopId) -> Option<(Arc<Record>, Duration)>;
+    /// Points of other hosts, in the order asked; none where no host answers for one.
+    fn points_elsewhere(&self, points: Vec<PointId>) -> Later<Vec<Option<Aged>>>;
+    /// An operator's command; ends when a record holds its outcome.
+    fn command(&self, id: LoopId, body: CommandBody) -> Later<Result<(), Error>>;
+    /// A value for a point that no loop writes.
+    fn write_point(&self, point: PointId, value: f64, by: String) -> Later<Result<(), Error>>;
+}
+
+impl Plant for Deploy {
+    fn point_here(&self, point: &PointId) -> Option<Aged> {
+        self.reading_here(point)
+    }
+
+    fn last(&self, id: &LoopId) -> Option<(Arc<Record>, Duration)> {
+        self.last_record(id)
+    }
+
+    fn points_elsewhere(&self, points: Vec<PointId>) -> Later<Vec<Option<Aged>>> {
+        let deploy = self.clone();
+        Box::pin(async move { deploy.readings_elsewhere(&points).await })
+    }
+
+    fn command(&self, id: LoopId, body: CommandBody) -> Later<Result<(), Error>> {
+        let deploy = self.clone();
+        Box::pin(async move {
+            let end = Self::command(&deploy, &id, None, body).await?;
+            match end.applied.outcome {
+                bumpless_core::Outcome::Done => Ok(()),
+                bumpless_core::Outcome::Refused(reason) => Err(Error::refused(reason, "")),
+            }
+        })
+    }
+
+    fn write_point(&self, point: PointId, value: f64, by: String) -> Later<Result<(), Error>> {
+        let deploy = self.clone();
+        Box::pin(async move { deploy.put_point(&point, value, by).await })
+    }
+}
+
+/// A mode as a number: 0 manual, 1 automatic.
+pub(crate) const fn mode_number(mode: Mode) -> f64 {
+    match mode {
+        Mode::Manual => 0.0,
+        Mode::Automatic => 1.0,
+    }
+}
