@@ -266,7 +266,7 @@ impl World {
             return;
         };
         match answer {
-            Answer::Commit(record) => self.commit(number, *record),
+            Answer::Commit(record) => self.commit(number, &record),
             Answer::Held {
                 term, seq, host: by, ..
             } => {
@@ -286,7 +286,7 @@ impl World {
     }
 
     /// The owner's record: checked, written, taken, told to everyone who holds the loop.
-    fn commit(&mut self, number: u32, made: Record) {
+    fn commit(&mut self, number: u32, made: &Record) {
         let broken = self.broken();
         let now_ns = self.now_ns;
         let home = self.loops[number as usize].home;
@@ -314,7 +314,7 @@ impl World {
             _ => record.outputs.first().copied().unwrap_or(f64::NAN),
         };
         let write = Write {
-            made: &made,
+            made,
             value,
             owner_then: desk.owner(),
             base: desk.last().map(AsRef::as_ref),
@@ -426,7 +426,7 @@ impl World {
         }
         let Some(desk) = l.desk.as_mut() else { return };
         l.client.asked += 1;
-        let body = if l.client.asked % REVISE_EVERY == 0 {
+        let body = if l.client.asked.is_multiple_of(REVISE_EVERY) {
             let newest = l.specs.last().map_or(1, |spec| spec.revision);
             let spec = law::spec(number, newest + 1);
             l.specs.push(Arc::new(spec));

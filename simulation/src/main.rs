@@ -18,7 +18,7 @@ const COURSE_LINES: usize = 60;
 const SIZE_SECONDS: u64 = 20;
 /// By how much the messages of cycles may grow from the smallest cell to the largest: what a larger cell does differently is
 /// that a loop's home is less often one of its replicas, so that a message more is sent.
-const GROWTH_MAX: f64 = 1.5;
+const GROWTH_MAX: f64 = 1.2;
 
 /// Runs whole cells in simulated time, from a seed.
 #[derive(Parser)]

@@ -31,7 +31,7 @@ impl FlipBits {
     pub(crate) fn disturb(&self, step: &mut Result<Effects, Fault>) {
         let Ok(effects) = step else { return };
         let steps = self.steps.fetch_add(1, Ordering::Relaxed) + 1;
-        if steps % self.every.get() != 0 {
+        if !steps.is_multiple_of(self.every.get()) {
             return;
         }
         if let Some((_, value)) = effects.writes.first_mut() {
