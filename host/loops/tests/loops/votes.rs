@@ -52,7 +52,7 @@ fn the_majority_is_taken_and_the_one_that_errs_loses_its_vote() {
 fn one_that_erred_once_votes_again_after_clean_steps() {
     let every = u64::from(CLEAN_STEPS) * 3;
     let mut bench = Bench::with_errors(&["a", "b", "c"], &[("b", every)], |spec| {
-        spec.strategy = Strategy::Vote(3)
+        spec.strategy = Strategy::Vote(3);
     });
     let lost = bench.until("dissent", |r| dissent(r, "b"));
     let back = bench.until("it votes again", |r| {
