@@ -58,7 +58,7 @@ fn an_alarm_lives_by_the_process_and_by_people_and_outlives_its_host() {
     let shelved = json!({ "act": "shelve", "by": "ann", "seconds": 3600, "reason": "the tank is being filled" });
     assert_eq!(api.post(&path, &shelved).unwrap()["quiet"], true);
     let standing = api.get("/v1/alarms").unwrap();
-    let names = standing["alarms"]
+    let mut names = standing["alarms"]
         .as_array()
         .into_iter()
         .flatten()
