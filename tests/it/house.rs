@@ -219,8 +219,11 @@ fn unsafe_code_is_where_it_must_be_and_says_why_it_is_sound() {
         let lines: Vec<&str> = text.lines().collect();
         for (n, line) in lines.iter().enumerate() {
             let code = line.split("//").next().unwrap_or_default();
+            // What stands in quotes is no code.
             let word = code
-                .split(|c: char| !c.is_alphanumeric() && c != '_')
+                .split('"')
+                .step_by(2)
+                .flat_map(|part| part.split(|c: char| !c.is_alphanumeric() && c != '_'))
                 .any(|word| word == "unsafe");
             // This file names the word.
             if !word || path == "tests/it/house.rs" {
