@@ -162,6 +162,7 @@ fn one(report: &mut Report, engine: &Engine, setting: &Setting, time: Duration) 
             HomeRevision {
                 spec: Arc::clone(&spec),
                 wiring,
+                term_floor: 0,
             },
             None,
         )?;

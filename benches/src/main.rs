@@ -20,6 +20,7 @@ mod kills;
 mod lab;
 mod law;
 mod local;
+mod masters;
 mod page;
 mod peer;
 mod redundancy;
@@ -76,6 +77,8 @@ enum Bench {
     Swap(switch::Switching),
     /// The operator's page with 50 loops: first paint, frames, processor, memory; and what 30 readers do to the cycles.
     Page(page::Watching),
+    /// One device, two hosts that may write it: the one that does is killed or stopped. Double writes, and pauses.
+    Masters,
     /// From an upload to the first cycle, what running loops feel of it, bombs, and many uploads at once.
     Upload,
     /// Virtual time: hours of the pilot plant per second and core, against the same experiment as plain functions.
@@ -152,6 +155,7 @@ fn run(bench: &Bench, options: Options) -> Result<bool, Error> {
         Bench::Chaos(_) => "chaos",
         Bench::Redundancy { .. } => "redundancy",
         Bench::Failover { .. } => "failover",
+        Bench::Masters => "masters",
         Bench::Select => "select",
         Bench::Swap(_) => "swap",
         Bench::Lab => "lab",
@@ -171,6 +175,7 @@ fn run(bench: &Bench, options: Options) -> Result<bool, Error> {
         Bench::Chaos(wishes) => chaos::run(options, wishes, &mut report)?,
         Bench::Redundancy { svg } => redundancy::run(options, svg, &mut report)?,
         Bench::Failover { only } => failover::run(options, *only, &mut report)?,
+        Bench::Masters => masters::run(options, &mut report)?,
         Bench::Select => select::run(options, &mut report)?,
         Bench::Swap(switching) if switching.is_wanted() => switch::run(options, *switching, &mut report)?,
         Bench::Swap(_) => swap::run(options, &mut report)?,

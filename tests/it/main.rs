@@ -5,6 +5,8 @@
 //! | story | a loop's whole life: swaps, commands, the death of its owner |
 //! | restarts | the whole cell, or the I/O host alone, dies and comes back |
 //! | changes | what may change while a loop runs, what brings it back, and owners that die meanwhile |
+//! | commissioning | points by hand, forces, jobs, point lists |
+//! | masters | two hosts for one device |
 //! | members | frozen owners, late hosts, hosts that leave |
 //! | drain | hosts that are emptied, restarted one by one, preferred, cut off |
 //! | chaos | faults by a seed, under the checker |
@@ -34,12 +36,14 @@ mod alarms;
 mod calls;
 mod changes;
 mod chaos;
+mod commissioning;
 mod drain;
 mod guides;
 mod history;
 mod house;
 mod lab;
 mod library;
+mod masters;
 mod members;
 mod modbus;
 mod neighbours;

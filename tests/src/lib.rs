@@ -13,10 +13,12 @@ mod api;
 mod binary;
 mod cell;
 mod chaos;
+mod device;
 mod error;
 mod feed;
 mod host;
 mod journal;
+pub mod masters;
 mod slots;
 mod wait;
 mod watchdog;
@@ -30,6 +32,7 @@ pub use chaos::{
     Breach, Disk, Fault, Inflictor, Kind, Net, Observer, Operator, Order, Outcome, Profile, Relay, Schedule, Seen, Way,
     Window, kept_commands, unix_ns,
 };
+pub use device::{FieldDevice, Obeyed};
 pub use error::Error;
 pub use feed::{Event, Feed};
 pub use host::{HostOptions, HostProcess};

@@ -18,6 +18,7 @@ pub mod types;
 mod cell;
 mod error;
 mod extract;
+mod field;
 mod gate;
 mod metrics;
 mod notices;

@@ -4,7 +4,7 @@ use utoipa::OpenApi;
 
 use crate::{
     error::Problem,
-    routes::{alarms, bundle, components, demo, history, hosts, live, loops, pages, rollouts, trend},
+    routes::{alarms, bundle, components, demo, field, history, hosts, live, loops, pages, rollouts, trend},
     types,
 };
 
@@ -25,9 +25,11 @@ use crate::{
         rollouts::start, rollouts::list, rollouts::show, rollouts::stop,
         alarms::list, alarms::past, alarms::act, alarms::define, alarms::remove,
         hosts::list, hosts::drain, hosts::undrain, hosts::points, live::feed, trend::trend, trend::list_notices, demo::show, demo::fault,
+        field::point, field::write, field::force, field::unforce, field::buses,
+        field::start, field::jobs, field::job, field::cancel,
         pages::healthz, pages::readyz, pages::metrics, pages::openapi,
     ),
-    components(schemas(Problem, types::Record, types::Hosts, types::LiveRows, types::Standing)),
+    components(schemas(Problem, types::Record, types::Hosts, types::LiveRows, types::Standing, types::FieldNews)),
     tags(
         (name = "components", description = "The library of control components"),
         (name = "loops", description = "Controllers bound to points"),
@@ -36,6 +38,7 @@ use crate::{
         (name = "rollouts", description = "One component for many loops: one loop first, then the rest by rule"),
         (name = "alarms", description = "What stands, what happened, and what people do about it, by ANSI/ISA-18.2"),
         (name = "cell", description = "Hosts, points and the live feed"),
+        (name = "field", description = "Points by hand, forces, buses, and jobs: what takes long is acknowledged at once and told of later"),
         (name = "operation", description = "For supervisors and monitoring"),
     )
 )]

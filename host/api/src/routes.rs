@@ -6,6 +6,7 @@ pub(crate) mod alarms;
 pub(crate) mod bundle;
 pub(crate) mod components;
 pub(crate) mod demo;
+pub(crate) mod field;
 pub(crate) mod history;
 pub(crate) mod hosts;
 pub(crate) mod live;
@@ -71,6 +72,14 @@ pub(crate) fn all() -> Router<App> {
         .route("/v1/hosts/{name}/drain", post(hosts::drain))
         .route("/v1/hosts/{name}/undrain", post(hosts::undrain))
         .route("/v1/points", get(hosts::points))
+        .route("/v1/points/{name}", get(field::point))
+        .route("/v1/points/{name}/write", post(field::write))
+        .route("/v1/points/{name}/force", post(field::force))
+        .route("/v1/points/{name}/unforce", post(field::unforce))
+        .route("/v1/buses", get(field::buses))
+        .route("/v1/jobs", get(field::jobs).post(field::start))
+        .route("/v1/jobs/{id}", get(field::job))
+        .route("/v1/jobs/{id}/cancel", post(field::cancel))
         .route("/v1/live", get(live::feed))
         .route("/v1/loops/{name}/trend", get(trend::trend))
         .route("/v1/notices", get(trend::list_notices))

@@ -6,6 +6,7 @@
 mod alarms;
 mod candidates;
 pub(crate) mod fake;
+mod field;
 mod history;
 mod hosts;
 mod library;

@@ -8,6 +8,7 @@
 mod alarms;
 mod call;
 mod component;
+mod field;
 mod history;
 mod hosts;
 mod library;
@@ -24,6 +25,10 @@ pub use alarms::{
 };
 pub use call::{CallAnswer, CallRequest};
 pub use component::{Component, Components, Parameter, Port};
+pub use field::{
+    Block, Bus, Buses, ByRequest, FieldNews, Force, ForceRequest, Job, JobRequest, JobState, Jobs, NamedJob, ReadBlock,
+    Redundant, ScanRequest, Table, WriteBlock, WriteRequest,
+};
 pub use history::{
     BacktestRequest, CurvePoint, CycleFinding, Cycles, LoopIndices, OutputTrial, Replay, ReplayRequest, Shadow,
     ShadowRequest, Shadows, Skipped, StepTimes, Trial, TrialVerdict,

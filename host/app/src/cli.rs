@@ -10,6 +10,7 @@ use clap_complete::Shell;
 mod alarm;
 mod cell;
 mod history;
+pub(crate) mod io;
 mod lab;
 mod library;
 mod rollout;
@@ -78,6 +79,11 @@ pub(crate) enum Command {
     },
     /// Control experiments in virtual time: run, compare, sweep, report; from a recorded loop, and to a live one.
     Lab(LabArgs),
+    /// Points and devices: scan, read, write, watch, force, jobs, point lists.
+    Io {
+        #[command(subcommand)]
+        what: io::IoCommand,
+    },
     /// Run one step of a component somewhere in the cell.
     Call(CallArgs),
     /// The hosts of the cell: list, drain, undrain.
@@ -335,6 +341,7 @@ pub fn run(cli: Cli) -> Result<(), Error> {
         Command::Rollout { what } => commands::rollouts::run(&client()?, json, what),
         Command::Alarm { what } => commands::alarms::run(&client()?, json, what.unwrap_or(AlarmCommand::standing())),
         Command::Lab(LabArgs { what }) => commands::lab::run(client, json, what),
+        Command::Io { what } => commands::io::run(client, json, what),
         Command::Call(args) => commands::components::call(&client()?, json, args),
         Command::Hosts { what } => commands::hosts::run(&client()?, json, what.unwrap_or(HostsCommand::List)),
         Command::Points => commands::hosts::points(&client()?, json),
@@ -412,6 +419,21 @@ mod tests {
             "bumpless lab fit window.json",
             "bumpless lab promote a.toml pressure --by itae --cycles 100 --wait",
             "bumpless call pid --input pv=1 --input ff=-2 --strategy latency",
+            "bumpless io scan 192.0.2.7:502 --units 1-3,9 --table holding --table coil --last 999",
+            "bumpless io scan --bus line --host plant",
+            "bumpless io read oven.pv oven.out --json",
+            "bumpless io write oven.out -4.5 --by ann",
+            "bumpless io watch oven.pv --every-ms 100 --looks 3",
+            "bumpless io force oven.pv 80 --for 10m --why test",
+            "bumpless io unforce oven.pv",
+            "bumpless io map --config host.toml --bus line",
+            "bumpless io export --config host.toml --bus line -o points.csv",
+            "bumpless io import points.csv --config host.toml --bus line --write",
+            "bumpless io job start line set-range --wait --key k",
+            "bumpless io job start line write-block --table holding --address 7 --values 1,2,3",
+            "bumpless io job show plant.1000001",
+            "bumpless io job list",
+            "bumpless io job cancel plant.1000001",
             "bumpless watch pressure --plain --cycles 5",
             "bumpless hosts --json",
             "bumpless hosts drain a --keep",
@@ -444,6 +466,10 @@ mod tests {
                 "bumpless alarm shelve pressure high --for soon --reason x",
                 "write it as 30s, 10m or 2h",
             ),
+            ("bumpless io force oven.pv 80 --why test", "--for"),
+            ("bumpless io force oven.pv 80 --for 25h --why test", "1s to 24h"),
+            ("bumpless io scan", "<ADDRESS>"),
+            ("bumpless io scan h:502 --units 9-1", "lies behind the last"),
             ("bumpless lop", "'loop'"),
         ] {
             let error = parse(bad).expect_err(bad);

@@ -34,6 +34,14 @@ impl Arbiter {
         }
     }
 
+    /// The next term is greater than `floor`. Nobody owns the loop then, if somebody did under a lesser one.
+    pub fn raise_terms(&mut self, floor: u64) {
+        if floor > self.term {
+            self.term = floor;
+            self.owner = None;
+        }
+    }
+
     /// Gives the ownership to `host` under a new term. Whatever the owner before still sends is refused from now on.
     pub fn appoint(&mut self, host: HostId) -> u64 {
         self.term += 1;
@@ -182,6 +190,18 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn a_raised_floor_fences_whoever_was_before() {
+        let mut arbiter = Arbiter::new((4, 90), 0);
+        let mut old = test_record();
+        (old.term, old.owner, old.seq, old.after) = (arbiter.appoint(host(1)), host(1), 91, (4, 90));
+        arbiter.open(91);
+        arbiter.raise_terms(3_000);
+        assert_eq!(arbiter.check(&old), Err(Refusal::OldTerm));
+        arbiter.raise_terms(7);
+        assert_eq!(arbiter.appoint(host(2)), 3_001);
     }
 
     #[test]

@@ -135,6 +135,11 @@ impl Desk {
         }
     }
 
+    /// Gives only greater terms than `floor` from now on. For a home that another host had before: see [`crate::lease`].
+    pub fn raise_terms(&mut self, floor: u64) {
+        self.arbiter.raise_terms(floor);
+    }
+
     /// The specification in force.
     #[must_use]
     pub const fn spec(&self) -> &Arc<LoopSpec> {

@@ -166,6 +166,15 @@ impl Intent {
         }
     }
 
+    /// The loop has another home from now on; what was on its way is not any more. `skipped` revision numbers are passed over,
+    /// for those that the home before gave out and could not tell of.
+    pub fn adopt(&mut self, home: HostId, skipped: u64) {
+        self.home = home;
+        self.pending = None;
+        self.last_revision = self.last_revision.saturating_add(skipped);
+        self.changed();
+    }
+
     /// A revision: in force, on its way, or past.
     #[must_use]
     pub fn find(&self, revision: u64) -> Option<&LoopSpec> {
@@ -259,6 +268,18 @@ mod tests {
             intent.pending.as_ref().map(|s| s.revision),
             past,
         )
+    }
+
+    #[test]
+    fn a_new_home_is_newer_than_whatever_the_old_one_could_not_tell() {
+        let (mut old, mut new) = (intent(), intent());
+        new.adopt(HostId::new("io-2").unwrap(), 100);
+        for _ in 0..9 {
+            let revision = old.propose(spec(2.0)).unwrap();
+            old.withdraw(revision).unwrap();
+        }
+        assert!(new.position() > old.position() && new.pending.is_none());
+        assert_eq!(new.propose(spec(3.0)).unwrap(), 102);
     }
 
     #[test]

@@ -30,6 +30,7 @@ pub mod damping;
 pub mod desk;
 pub mod guard;
 pub mod indices;
+pub mod lease;
 pub mod place;
 pub mod seat;
 pub mod select;

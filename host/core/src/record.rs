@@ -140,6 +140,10 @@ pub enum Event {
         /// Equal answers that were needed.
         needed: u8,
     },
+    /// A person holds this port's point at a value, from this cycle on.
+    Forced(u8),
+    /// The point of this port is held no more.
+    Unforced(u8),
 }
 
 /// What one cycle leaves. Written once by the owner, completed and ordered by the arbiter.

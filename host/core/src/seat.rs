@@ -16,7 +16,7 @@ use crate::{
     limits::{DT_PERIODS_MAX, OUTCOMES_REMEMBERED_MAX},
     name::HostId,
     protocol::Sample,
-    reading::Reading,
+    reading::{Quality, Reading},
     record::{Applied, CommandBody, CommandId, Event, Outcome, Record},
     redundancy::Redundancy,
     spec::{LoopSpec, Mode, OnFault},
@@ -292,7 +292,8 @@ pub fn conclude(c: Conclusion<'_>) -> Record {
         cycle_ns,
     } = c;
     let dt_ns = dt_ns(base, spec, sample);
-    let held = wiring.held(&readings);
+    let held = wiring.held_since(&readings, base, spec.revision);
+    tell_forces(&readings, base, spec, &mut events);
     let faults_before = base.map_or(0, |r| r.faults_in_row);
     let wanted_before = base
         .filter(|r| r.wanted.len() == held.len())
@@ -335,8 +336,11 @@ pub fn conclude(c: Conclusion<'_>) -> Record {
                     standing.manual.clone()
                 }
             };
+            // Where the policy moved an output away under a component that saw nothing, what the component remembers belongs to
+            // where the output was. It begins anew from the actuator when it sees again, so that the way back has no bump.
+            let moved = outputs.iter().zip(&held).any(|(o, h)| o.to_bits() != h.to_bits());
             let effects = Effects {
-                state: state.to_vec(),
+                state: if bad_input && moved { Vec::new() } else { state.to_vec() },
                 ..Effects::default()
             };
             (
@@ -401,6 +405,23 @@ pub fn conclude(c: Conclusion<'_>) -> Record {
         step_ns,
         cycle_ns,
         committed_after_ns: 0,
+    }
+}
+
+/// Says which points a person began or ceased to hold since the record before.
+fn tell_forces(readings: &[Reading], base: Option<&Record>, spec: &LoopSpec, events: &mut Vec<Event>) {
+    let before = base
+        .filter(|r| r.revision == spec.revision)
+        .map_or(&[][..], |r| &r.readings);
+    for (port, reading) in (0..=u8::MAX).zip(readings) {
+        let was = before
+            .get(usize::from(port))
+            .is_some_and(|r| r.quality == Quality::Forced);
+        match (was, reading.quality == Quality::Forced) {
+            (false, true) => events.push(Event::Forced(port)),
+            (true, false) => events.push(Event::Unforced(port)),
+            _ => {}
+        }
     }
 }
 

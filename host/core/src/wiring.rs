@@ -6,6 +6,7 @@ use crate::{
     descriptor::{Descriptor, Direction},
     name::PointId,
     reading::{NoData, Reading},
+    record::Record,
     spec::{LoopSpec, OutputLimit, SpecError},
 };
 
@@ -89,6 +90,21 @@ impl Wiring {
                 _ => f64::NAN,
             })
             .collect()
+    }
+
+    /// As [`Wiring::held`]; where no reading says what an actuator holds, as after a start of its host, it is what the record
+    /// before committed, if that was under this revision.
+    #[must_use]
+    pub fn held_since(&self, readings: &[Reading], base: Option<&Record>, revision: u64) -> Vec<f64> {
+        let mut held = self.held(readings);
+        if let Some(base) = base.filter(|r| r.revision == revision && r.outputs.len() == held.len()) {
+            for (held, committed) in held.iter_mut().zip(&base.outputs) {
+                if !held.is_finite() {
+                    *held = *committed;
+                }
+            }
+        }
+        held
     }
 
     /// One value per output from a step's writes; an output that was not written keeps `before`.

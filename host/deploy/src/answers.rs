@@ -36,10 +36,7 @@ impl Room {
                     self.poke();
                     Ok(Told::Holds(holds))
                 }
-                Ask::Find(points) => {
-                    let here = |point| self.io.as_ref().is_some_and(|io| io.index(point).is_some());
-                    Ok(Told::Found(points.iter().map(here).collect()))
-                }
+                Ask::Find(points) => Ok(Told::Found(points.iter().map(|point| self.speaks_for(point)).collect())),
                 Ask::Put(point, value, by) => self.put_here(&point, value, &by).map(|()| Told::Done),
                 Ask::Read(points) => Ok(self.read_here(&points)),
                 Ask::Points(first) => Ok(self.points_here(first)),
@@ -78,6 +75,7 @@ impl Room {
                 Ask::Shadow(id, ask) => self.shadow_here(&from, id, ask).await,
                 Ask::Alarm(ask) => self.alarms_here(ask).await,
                 Ask::Rollout(ask) => self.rollout_here(ask).await,
+                Ask::Field(ask) => self.field_here(*ask).await.map(Box::new).map(Told::Field),
                 Ask::Records(ids) => {
                     let last = ids.iter().take(RECORDS_ASKED).filter_map(|id| self.feed.last(id));
                     Ok(Told::Records(last.map(|last| (*last.record).clone()).collect()))

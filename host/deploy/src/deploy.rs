@@ -29,6 +29,7 @@ use crate::{
 };
 
 mod alarms;
+mod field;
 mod past;
 mod points;
 mod rollouts;

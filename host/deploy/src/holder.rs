@@ -77,6 +77,15 @@ impl Holder {
             .is_some_and(|held| held.revisions.contains(&revision))
     }
 
+    /// The loop's home is this one, from now on if it was another: that one must be told what is held.
+    fn home_is(&self, id: &LoopId, home: &HostId) {
+        if let Some(held) = self.held.lock().get_mut(id)
+            && held.home.as_ref() != Some(home)
+        {
+            held.home = Some(home.clone());
+        }
+    }
+
     /// A home that came or went must be told everything again.
     pub(crate) fn forget_reports_to(&self, home: &HostId) {
         self.told.lock().remove(home);
@@ -182,6 +191,7 @@ impl Room {
             if !wanted_members(&intent, &eligible).contains(&self.here) {
                 continue;
             }
+            self.holder.home_is(&intent.loop_id, &intent.home);
             let wanted = wanted_revisions(&intent);
             let numbers: Vec<u64> = wanted.iter().map(|spec| spec.revision).collect();
             self.keep_only(&intent.loop_id, &numbers);

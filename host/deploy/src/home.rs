@@ -29,6 +29,7 @@ use crate::{
     error::Error,
     holder::{wanted_members, wanted_revisions},
     limits::{ANSWER_WAIT, GATHER_WAIT, MOVE_WAIT, RECORDS_ASKED},
+    masters::Mastery,
     plan::PointFacts,
     preference::{Favourites, Look},
     room::{Locks, Room},
@@ -46,6 +47,8 @@ const MOVE_LOOK: Duration = Duration::from_millis(200);
 struct Opened {
     /// The members that the loops were last told.
     members: Vec<HostId>,
+    /// The mastership under which it was opened; none where its devices have one master.
+    epoch: Option<u32>,
     /// An owner that shall give the loop away, and since when.
     leaving: Option<(HostId, Instant)>,
     /// What is remembered of the hosts that it prefers.
@@ -72,6 +75,11 @@ impl Homes {
 
     pub(crate) fn is_open(&self, id: &LoopId) -> bool {
         self.opened.lock().contains_key(id)
+    }
+
+    /// The mastership under which a home was opened.
+    pub(crate) fn epoch(&self, id: &LoopId) -> Option<u32> {
+        self.opened.lock().get(id).and_then(|opened| opened.epoch)
     }
 
     /// A host reports what it holds. Gives back how much it is believed to hold now.
@@ -209,6 +217,7 @@ impl Room {
         Ok(HomeRevision {
             spec: Arc::new(spec.clone()),
             wiring: Arc::new(wiring),
+            term_floor: self.term_floor(spec),
         })
     }
 
@@ -253,6 +262,7 @@ impl Room {
 
     /// Settles revisions, tells members, opens homes. Idempotent.
     pub(crate) async fn keep_homes(self: &Arc<Self>) {
+        self.follow_masters().await;
         let ours = || self.book.all().into_iter().filter(|intent| intent.home == self.here);
         // The open ones first: opening may have to wait for other hosts.
         let eligible = self.roster.eligible();
@@ -272,6 +282,10 @@ impl Room {
                 return;
             }
             let lock = self.homes.locks.of(id);
+            // Where another master has the device, or nobody, nothing could be written.
+            if self.mastery(&intent.current) == Mastery::Away {
+                continue;
+            }
             // A new loop is opened by the change that creates it.
             if self.holder.due(id, revision)
                 && let Ok(_turn) = lock.try_lock()
@@ -322,6 +336,8 @@ impl Room {
 
     /// Hands a home to the loops.
     pub(crate) async fn open(self: &Arc<Self>, intent: &Intent, last: Option<Arc<Record>>) -> Result<(), Error> {
+        // Looked at before the floor of the terms is: one that came meanwhile is noticed, and the home opened again.
+        let mastery = self.mastery(&intent.current);
         let revision = self.home_revision(&intent.current).await?;
         self.field
             .open_home(revision, last)
@@ -339,10 +355,16 @@ impl Room {
                 tracing::warn!(loop_id = %spec.id, revision = spec.revision, error, "an earlier revision cannot be gone back to");
             }
         }
-        self.homes
-            .opened
-            .lock()
-            .insert(intent.loop_id.clone(), Opened::default());
+        self.homes.opened.lock().insert(
+            intent.loop_id.clone(),
+            Opened {
+                epoch: match mastery {
+                    Mastery::Master(epoch) => Some(epoch),
+                    Mastery::Alone | Mastery::Away => None,
+                },
+                ..Opened::default()
+            },
+        );
         self.holder.succeeded(&intent.loop_id, intent.current.revision);
         if self.tell_members(intent, &self.roster.eligible()) {
             self.poke_in(MOVE_LOOK);

@@ -37,6 +37,7 @@ mod field;
 mod holder;
 mod home;
 mod library;
+mod masters;
 mod orders;
 mod plan;
 mod preference;
@@ -52,6 +53,7 @@ mod uploads;
 mod verdict;
 mod wire;
 
+pub mod commissioning;
 pub mod draft;
 pub mod limits;
 pub mod report;

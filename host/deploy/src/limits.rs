@@ -203,6 +203,36 @@ pub const ROLLOUT_LOOK_EVERY: Duration = Duration::from_millis(200);
 /// may be lost, and hosts may go.
 pub const ROLLOUT_WATCH_SLACK: Duration = Duration::from_secs(30);
 
+/// Events of points and jobs that the live feed holds for a slow receiver; it then loses the oldest.
+pub const FIELD_EVENTS: usize = 1_024;
+
+/// How often forces are looked at: one that is over counts no more in any case, this only says so.
+pub const FORCES_LOOK: Duration = Duration::from_secs(1);
+
+/// Characters of a name or a reason that people give.
+pub const WORDS_CHARS_MAX: usize = 200;
+
+/// Jobs that wait for one bus; the next one is refused.
+pub const JOBS_WAITING_MAX: usize = 16;
+
+/// Jobs that a host keeps to be looked at; of those that ended the oldest goes.
+pub const JOBS_KEPT_MAX: usize = 256;
+
+/// Jobs between two starts of a host: their numbers go on after it.
+pub const JOBS_PER_START_MAX: u64 = 1_000_000;
+
+/// Longest wait of a job for its turn, in ms: one hour.
+pub const JOB_QUEUE_MS_MAX: u64 = 3_600_000;
+
+/// Values that one job reads or writes: 40 KB, and its result fits in a reply.
+pub const JOB_RESULT_VALUES_MAX: usize = 20_000;
+
+/// Pause between two looks at what a job expects of a device.
+pub const JOB_EXPECT_PAUSE: Duration = Duration::from_millis(50);
+
+/// Terms of one mastership of a device with two masters: at ten changes of ownership a second, three years.
+pub const TERMS_PER_EPOCH: u64 = 1_000_000_000;
+
 /// Longest time of a first call on a new instance, in ns: its memory is touched for the first time.
 pub const WARM_LIMIT_NS: u64 = 100_000_000;
 

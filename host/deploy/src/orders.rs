@@ -16,6 +16,7 @@ use tokio::{sync::oneshot, time::timeout};
 use crate::{
     error::{Error, chain},
     limits::{CHANGE_WAIT, COMMAND_WAIT_MAX, COMMAND_WAIT_MIN},
+    masters::Mastery,
     room::Room,
     view::CommandEnd,
     wire::Notice,
@@ -30,6 +31,12 @@ impl Room {
     pub(crate) fn ours(&self, id: &LoopId) -> Result<Arc<Intent>, Error> {
         let intent = self.book.find(id)?;
         if intent.home == self.here {
+            if self.mastery(&intent.current) == Mastery::Away {
+                return Err(Error::busy(
+                    format!("host {} is not the master of loop {id}'s device now", self.here),
+                    "try again when a host is",
+                ));
+            }
             return Ok(intent);
         }
         Err(Error::refused(

@@ -124,7 +124,7 @@ impl Replay {
 
 /// Makes a recorded step again. Says in words what came out otherwise.
 fn again(held: &mut HeldRevision, base: Option<&Record>, record: &Record) -> Result<(), String> {
-    let actuators = held.wiring.held(&record.readings);
+    let actuators = held.wiring.held_since(&record.readings, base, held.spec.revision);
     let carried = base.filter(|r| r.digest == held.spec.digest && !r.state.is_empty());
     let state: Arc<[u8]> = match carried {
         Some(base) => Arc::clone(&base.state),

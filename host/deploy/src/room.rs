@@ -34,6 +34,7 @@ use crate::{
     alarms::Alarms,
     bench::Bench,
     book::Book,
+    commissioning::Commissioning,
     drain,
     error::{Error, Words, chain},
     feed::Feed,
@@ -150,6 +151,7 @@ pub(crate) struct Room {
     pub(crate) shadows: Shadows,
     pub(crate) rollouts: Ledger,
     pub(crate) alarms: Alarms,
+    pub(crate) commissioning: Commissioning,
     /// Replays and backtests.
     pub(crate) rehearsals: Semaphore,
     pub(crate) holder: Holder,
@@ -231,6 +233,7 @@ impl Room {
             shadows: Shadows::default(),
             rollouts: Ledger::default(),
             alarms: Alarms::default(),
+            commissioning: Commissioning::new(&store, clock)?,
             rehearsals: Semaphore::new(REHEARSALS_MAX),
             holder: Holder::default(),
             homes: Homes::default(),
@@ -272,6 +275,8 @@ impl Room {
         room.read_alarms()?;
         room.spawn(Self::watch_alarms(Arc::clone(&room), room.feed.subscribe()));
         room.resume_rollouts()?;
+        room.resume_forces()?;
+        room.watch_masters();
         Ok(room)
     }
 
@@ -387,6 +392,7 @@ impl Room {
                 }
             }
             DeployArrival::Bus(Arrival::Notice { from, payload }) => match wire::decode::<Notice>("notice", &payload) {
+                Ok(Notice::Field(event)) => self.commissioning.tell(*event),
                 Ok(notice) => {
                     if self.notices.try_send((from, notice)).is_err() {
                         count(&self.tallies.arrivals_dropped);

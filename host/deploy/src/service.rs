@@ -39,17 +39,21 @@ impl Room {
         };
         let writers = self.book.writers();
         let view = |info: &PointInfo| self.point_view(io, info, &writers);
+        // Of a device with two masters only the master tells.
+        let told = |info: &&PointInfo| io.index(&info.id).is_some_and(|index| io.speaks_for(index));
+        let total = io.points().iter().filter(told).count();
         let page = io
             .points()
             .iter()
+            .filter(told)
             .skip(first as usize)
             .take(POINTS_PER_PAGE)
             .map(view)
             .collect();
-        Told::Points(page, u32::try_from(io.points().len()).unwrap_or(u32::MAX))
+        Told::Points(page, u32::try_from(total).unwrap_or(u32::MAX))
     }
 
-    fn point_view(
+    pub(crate) fn point_view(
         &self,
         io: &IoServer,
         info: &PointInfo,
@@ -77,6 +81,7 @@ impl Room {
             },
             written_by: writers.get(&info.id).cloned(),
             text: info.text.clone(),
+            force: self.commissioning.force_of(&info.id),
         }
     }
 

@@ -209,6 +209,8 @@ pub struct PointView {
     pub written_by: Option<LoopId>,
     /// One line for people.
     pub text: String,
+    /// Who holds it at its value by hand, and until when; none where nobody does.
+    pub force: Option<crate::commissioning::ForceView>,
 }
 
 /// How an `apply` ended.

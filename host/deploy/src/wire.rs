@@ -14,6 +14,7 @@ use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
 use crate::{
     alarms::{AlarmAct, AlarmEvent, AlarmView},
+    commissioning::{FieldAsk, FieldEvent, FieldTold},
     draft::{Change, LoopDraft},
     error::{Error, Words},
     report::{CyclesView, ReplayReport, ShadowView, Trial, TrialReport},
@@ -22,7 +23,7 @@ use crate::{
 };
 
 /// Version of these lists. Another one is refused in words, so that a half updated cell says what is the matter.
-const VERSION: u8 = 2;
+const VERSION: u8 = 3;
 
 /// A position of an intent among its copies: see [`Intent::position`].
 pub(crate) type Position = (u64, u64);
@@ -84,6 +85,8 @@ pub(crate) enum Ask {
     Shadow(LoopId, ShadowAsk),
     /// About the rollouts of the host.
     Rollout(RolloutAsk),
+    /// To an I/O host: about its points, buses, forces and jobs.
+    Field(Box<FieldAsk>),
     /// About the alarms of loops at home there.
     Alarm(AlarmAsk),
     /// To an I/O host: these points now, at most a page of them.
@@ -214,13 +217,15 @@ pub(crate) enum Told {
     AlarmPast(Vec<AlarmEvent>),
     /// Readings in the order asked, with the age of each value in ns; none for points that are not here.
     Read(Vec<Option<(Reading, u64)>>),
+    /// What was asked about points, buses, forces and jobs.
+    Field(Box<FieldTold>),
     /// A component's bytes. Never written by serde: see [`encode_reply`].
     #[serde(skip)]
     Bytes(Vec<u8>),
 }
 
 /// What a host tells all others. A notice may be lost; `Standing`, repeated, finds what was missed.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) enum Notice {
     /// Marks of the library and of the intents: where they differ, the lists are compared.
     Standing {
@@ -237,6 +242,8 @@ pub(crate) enum Notice {
     Intent(LoopId, Position),
     /// A loop was removed.
     Gone(Tombstone),
+    /// Something happened to a point or a job.
+    Field(Box<FieldEvent>),
 }
 
 /// A value with its version.

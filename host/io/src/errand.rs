@@ -96,6 +96,8 @@ pub enum ErrandError {
 #[derive(Debug)]
 pub(crate) struct Posted {
     pub(crate) errand: Errand,
+    /// Part of the lease that decides who may write: it is not asked for one itself.
+    pub(crate) of_lease: bool,
     /// After this time the asker does not want it any more.
     pub(crate) until: Instant,
     pub(crate) reply: oneshot::Sender<Result<Vec<u16>, ErrandError>>,
@@ -103,20 +105,71 @@ pub(crate) struct Posted {
 
 /// The way of errands into a bus's task.
 #[derive(Debug, Clone)]
-pub(crate) struct Post(mpsc::Sender<Posted>);
+pub(crate) struct Post {
+    usual: mpsc::Sender<Posted>,
+    first: mpsc::Sender<Posted>,
+}
+
+/// The link's end: errands of the lease go first.
+#[derive(Debug)]
+pub(crate) struct Errands {
+    usual: mpsc::Receiver<Posted>,
+    first: mpsc::Receiver<Posted>,
+}
+
+impl Errands {
+    /// The next errand that waits.
+    pub(crate) fn try_recv(&mut self) -> Option<Posted> {
+        self.first.try_recv().or_else(|_| self.usual.try_recv()).ok()
+    }
+
+    /// Waits for an errand. None when nobody is left to send one. Nothing is lost where the wait is given up.
+    pub(crate) async fn recv(&mut self) -> Option<Posted> {
+        tokio::select! {
+            biased;
+            Some(posted) = self.first.recv() => Some(posted),
+            posted = self.usual.recv() => posted,
+        }
+    }
+}
 
 impl Post {
     /// Both ends. A full queue refuses.
-    pub(crate) fn new() -> (Self, mpsc::Receiver<Posted>) {
-        let (sender, receiver) = mpsc::channel(ERRANDS_WAITING_MAX);
-        (Self(sender), receiver)
+    pub(crate) fn new() -> (Self, Errands) {
+        let (usual, usual_out) = mpsc::channel(ERRANDS_WAITING_MAX);
+        // The lease sends one at a time.
+        let (first, first_out) = mpsc::channel(2);
+        let errands = Errands {
+            usual: usual_out,
+            first: first_out,
+        };
+        (Self { usual, first }, errands)
+    }
+
+    /// Puts an errand of the lease before all others.
+    pub(crate) fn send_first(&self, errand: Errand, until: Instant) -> Result<Asked, Error> {
+        let (reply, answer) = oneshot::channel();
+        let posted = Posted {
+            errand,
+            of_lease: true,
+            until,
+            reply,
+        };
+        // Full: the link has not come to the last one yet, which is a silence.
+        self.first.try_send(posted).map_err(|_| Error::Closed)?;
+        Ok(Asked { answer, until })
     }
 
     /// Puts an errand into the queue.
     pub(crate) fn send(&self, bus: &bumpless_core::BusId, errand: Errand, until: Instant) -> Result<Asked, Error> {
         let (reply, answer) = oneshot::channel();
-        let posted = Posted { errand, until, reply };
-        self.0.try_send(posted).map_err(|error| match error {
+        let posted = Posted {
+            errand,
+            of_lease: false,
+            until,
+            reply,
+        };
+        self.usual.try_send(posted).map_err(|error| match error {
             mpsc::error::TrySendError::Full(_) => Error::ErrandsFull(bus.clone()),
             mpsc::error::TrySendError::Closed(_) => Error::Closed,
         })?;

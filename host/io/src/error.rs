@@ -84,6 +84,12 @@ pub enum Error {
         /// What the system said.
         problem: String,
     },
+    /// A device that cannot be looked at from outside of its bus.
+    #[error("bus {0:?} is not plain Modbus TCP: its device cannot be scanned")]
+    NoScan(BusId),
+    /// Another host writes this bus.
+    #[error("bus {0:?}: this host is not the device's master now; nothing was written")]
+    NotMaster(BusId),
     /// A write after the end.
     #[error("the I/O of this host is closed; nothing was written")]
     Closed,

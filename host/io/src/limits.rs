@@ -44,6 +44,10 @@ pub const SCAN_REQUESTS_MAX: u32 = 8_000;
 /// Units of one scan: all that there are.
 pub const SCAN_UNITS_MAX: usize = 256;
 
+/// Shortest and longest lease of a device's master, in ms: a few polls of a quick device; a minute without an owner is too
+/// long for any.
+pub const LEASE_MS_RANGE: (u64, u64) = (200, 60_000);
+
 /// Journal lines that may wait for the disk: at 10,000 writes a second, six seconds of a disk that hangs.
 pub const JOURNAL_LINES_WAITING_MAX: usize = 65_536;
 

@@ -92,12 +92,12 @@ use std::path::Path;
 use bumpless_core::{BusId, PointId};
 use serde::{Deserialize, Serialize};
 
-use crate::{config::OnStop, job::JobConfig, scaling::Signal};
+use crate::{config::OnStop, job::JobConfig, master::RedundantConfig, scaling::Signal};
 
 pub use exception::Exception;
 pub use frame::Framing;
 pub use group::Table;
-pub(crate) use plan::{Plan, PlannedPoint, Transport};
+pub(crate) use plan::{Plan, PlannedPoint, Transport, Way};
 pub use request::{Answer, Request};
 pub use serial::Parity;
 pub use tls::{ClientTls, ServerTls};
@@ -181,6 +181,9 @@ pub struct ModbusConfig {
     /// Sequences of requests that can be started by name.
     #[serde(default, rename = "job", skip_serializing_if = "Vec::is_empty")]
     pub jobs: Vec<JobConfig>,
+    /// The other master of the device, if there is one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub redundant: Option<RedundantConfig>,
     /// The points.
     #[serde(default, rename = "point", skip_serializing_if = "Vec::is_empty")]
     pub points: Vec<ModbusPoint>,

@@ -199,7 +199,7 @@ impl Scanner<'_> {
             // A gateway says so of a unit that is not there.
             Err(Failure::Exception(Exception::PATH | Exception::TARGET)) => Seen::Silent,
             Err(Failure::Exception(_) | Failure::Malformed(_)) => Seen::Refused,
-            Err(Failure::Silent(_)) => Seen::Silent,
+            Err(Failure::Silent(_) | Failure::Fenced) => Seen::Silent,
             Err(Failure::Lost(_)) => {
                 self.connection = None;
                 Seen::Silent

@@ -18,6 +18,8 @@ pub struct HomeRevision {
     pub spec: Arc<LoopSpec>,
     /// Resolved against its component.
     pub wiring: Arc<Wiring>,
+    /// The home gives greater terms than this: those up to it may be another home's. 0 where there is no other.
+    pub term_floor: u64,
 }
 
 /// A revision as a holder needs it: it can be stepped here from now on.

@@ -98,9 +98,11 @@ impl Worker {
         let Opening { revision, last, view } = opening;
         let id = revision.spec.id.clone();
         let spec = Arc::clone(&revision.spec);
+        let term_floor = revision.term_floor;
         let known = self.known_revision(revision);
         let phase_ns = place::phase_ns(&id, spec.period_ns);
-        let desk = Desk::new(self.shared.here.clone(), spec, last, self.shared.now_ns(), phase_ns);
+        let mut desk = Desk::new(self.shared.here.clone(), spec, last, self.shared.now_ns(), phase_ns);
+        desk.raise_terms(term_floor);
         let home = Home {
             desk,
             known: vec![known],

@@ -8,6 +8,7 @@
 //! <dir>/                     0700
 //!   lock                     held while a process has the store open; names that process
 //!   host.redb                infos, intents, tombstones, last records, rollouts, alarms, settings
+//!   host.redb                infos, intents, tombstones, last records, rollouts, forces, settings
 //!   cycles.redb              every record of the loops at home here, up to a bound
 //!   components/<digest>.wasm the bytes, named by what they are
 //!   secrets/<name>           0600, 32 random bytes
@@ -16,6 +17,7 @@
 //! | what | durable when the call returns? | why |
 //! |---|---|---|
 //! | component, info, intent, tombstone, rollout, alarm, setting, secret | yes, fsync | people were told that it is done |
+//! | component, info, intent, tombstone, rollout, force, setting, secret | yes, fsync | people were told that it is done |
 //! | recorded cycle | no: within a second | it is for looking back; nothing that runs depends on it |
 //! | last record | no: within a second | the standbys hold newer ones; a sync per cycle would wear out the disk |
 //!
@@ -27,6 +29,7 @@ mod components;
 mod cycles;
 mod database;
 mod error;
+mod forces;
 mod format;
 mod intents;
 mod records;

@@ -20,6 +20,7 @@ use axum::{
     },
 };
 use bumpless_core::{LoopId, Record as CoreRecord};
+use bumpless_deploy::commissioning::FieldEvent;
 use futures_util::stream;
 use serde::Deserialize;
 use tokio::{
@@ -37,7 +38,7 @@ use crate::{
     extract::InQuery,
     limits::{BEAT_MS_DEFAULT, BEAT_MS_MAX, BEAT_MS_MIN, FEED_LOOPS_MAX, HOSTS_EVERY, KEEP_ALIVE, TRACES_MAX},
     server::App,
-    types::{Hosts, Record},
+    types::{FieldNews, Hosts, Record},
 };
 
 use rows::{Mark, Rows, Wanted};
@@ -74,7 +75,8 @@ pub(crate) enum Form {
     Rows,
 }
 
-/// Follows the records. Events: `record` (a record), `hosts` (the hosts, every second, the first at once), `lost` (how many
+/// Follows the records. Events: `record` (a record), `hosts` (the hosts, every second, the first at once), `field` (what happened to a point
+/// or a job, as FieldNews), `lost` (how many
 /// records this reader was too slow for).
 ///
 /// With `form=rows`, for pages that watch many loops: `rows` (LiveRows) every `every_ms` (50 to 10,000, else 200), `notices` (what
@@ -82,7 +84,7 @@ pub(crate) enum Form {
 /// `Last-Event-ID` a reader gets the notices and the traced cycles that it missed. A slow reader gets the newest of each loop.
 #[utoipa::path(get, operation_id = "follow_records", path = "/v1/live", tag = "cell", params(LiveQuery),
     responses(
-        (status = 200, description = "Server-sent events: `record` with a Record, `hosts` with Hosts, `lost` with {\"records\": n}; in rows: `rows`, `notices`, `hosts`, `loops`",
+        (status = 200, description = "Server-sent events: `record` with a Record, `hosts` with Hosts, `field` with FieldNews, `lost` with {\"records\": n}; in rows: `rows`, `notices`, `hosts`, `loops`",
             body = Record, content_type = "text/event-stream"),
         (status = "default", description = "What went wrong", body = Problem, content_type = "application/problem+json")))]
 pub(crate) async fn feed(
@@ -113,6 +115,7 @@ pub(crate) async fn feed(
     hosts.set_missed_tick_behavior(MissedTickBehavior::Skip);
     let feed = Feed {
         records: app.cell.records(),
+        news: app.cell.field_events(),
         stop: app.stop.clone(),
         hosts,
         filter: Filter {
@@ -221,6 +224,7 @@ impl Filter {
 struct Feed {
     app: App,
     records: broadcast::Receiver<Arc<CoreRecord>>,
+    news: broadcast::Receiver<FieldEvent>,
     hosts: Interval,
     stop: watch::Receiver<bool>,
     filter: Filter,
@@ -239,6 +243,13 @@ impl Feed {
                     let hosts = Hosts { hosts: self.app.cell.hosts().into_iter().map(Into::into).collect() };
                     Event::default().event("hosts").json_data(hosts)
                 }
+                news = self.news.recv() => match news {
+                    Ok(news) => Event::default().event("field").json_data(FieldNews::from(news)),
+                    Err(RecvError::Lagged(lost)) => {
+                        Event::default().event("lost").json_data(serde_json::json!({ "records": 0, "field": lost }))
+                    }
+                    Err(RecvError::Closed) => return None,
+                },
                 next = self.records.recv() => match next {
                     Ok(record) if self.filter.passes(&record) => {
                         let ports = self.app.ports(&record.digest);

@@ -52,6 +52,8 @@ pub(crate) struct Fake {
     pub(crate) windows: Mutex<Vec<Window>>,
     pub(crate) rollouts: Mutex<Vec<RolloutDraft>>,
     pub(crate) alarm_acts: Mutex<Vec<(String, AlarmAct, String)>>,
+    pub(crate) jobs: Mutex<Vec<bumpless_deploy::commissioning::JobDraft>>,
+    pub(crate) news: broadcast::Sender<bumpless_deploy::commissioning::FieldEvent>,
     records: broadcast::Sender<Arc<Record>>,
 }
 
@@ -74,6 +76,8 @@ impl Fake {
             windows: Mutex::default(),
             rollouts: Mutex::default(),
             alarm_acts: Mutex::default(),
+            jobs: Mutex::default(),
+            news: broadcast::channel(FEED_CAPACITY).0,
             records: broadcast::channel(FEED_CAPACITY).0,
         }
     }
@@ -89,7 +93,7 @@ impl Fake {
     }
 
     /// The answer, or the refusal that is set; late while the cell is slow.
-    fn answer<T: Send + 'static>(&self, value: T) -> Answer<T> {
+    pub(crate) fn answer<T: Send + 'static>(&self, value: T) -> Answer<T> {
         self.asked.fetch_add(1, Ordering::Relaxed);
         let refusal = self.refusal.lock().unwrap().clone();
         let wait = self.slow.load(Ordering::Relaxed).then(|| Arc::clone(&self.go_on));

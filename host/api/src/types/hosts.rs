@@ -4,7 +4,7 @@ use bumpless_deploy::{DrainEnd, HostView, PointView};
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-use super::{Quality, finite, ms};
+use super::{Force, Quality, finite, ms};
 
 /// The hosts of the cell, by name.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
@@ -153,6 +153,8 @@ pub struct Point {
     pub written_by: Option<String>,
     /// One line for people.
     pub text: String,
+    /// Who holds it at its value by hand; null where nobody does.
+    pub force: Option<Force>,
 }
 
 impl From<PointView> for Point {
@@ -170,6 +172,7 @@ impl From<PointView> for Point {
             age_ms: view.age_ms,
             written_by: view.written_by.map(Into::into),
             text: view.text,
+            force: view.force.map(Into::into),
         }
     }
 }

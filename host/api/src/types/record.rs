@@ -266,6 +266,16 @@ pub enum Event {
         /// The port.
         port: String,
     },
+    /// A person holds this port's point at a value, from this cycle on.
+    Forced {
+        /// The port.
+        port: String,
+    },
+    /// The point of this port is held no more.
+    Unforced {
+        /// The port.
+        port: String,
+    },
     /// Fewer replicas than the loop asks for can step now, and fewer than before.
     RedundancyLost {
         /// Those that can, the owner among them.
@@ -451,6 +461,12 @@ impl Event {
                 reason: reason.clone(),
             },
             model::Event::Limited(port) => Self::Limited {
+                port: ports.name(usize::from(*port)),
+            },
+            model::Event::Forced(port) => Self::Forced {
+                port: ports.name(usize::from(*port)),
+            },
+            model::Event::Unforced(port) => Self::Unforced {
                 port: ports.name(usize::from(*port)),
             },
             model::Event::BadInput(port) => Self::BadInput {

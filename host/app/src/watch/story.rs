@@ -295,6 +295,8 @@ fn in_words(event: &Event, record: &Record) -> Option<String> {
             agreed,
             needed,
         } => format!("no majority: {agreed} of {answers} answers agree, {needed} are needed"),
+        Event::Forced { port } => format!("{port} is forced"),
+        Event::Unforced { port } => format!("{port} is forced no more"),
         Event::Limited { .. } => return None,
     })
 }

@@ -272,6 +272,51 @@ fn a_bad_input_follows_its_own_policy_and_is_no_fault_of_the_component() {
 }
 
 #[test]
+fn the_way_back_from_a_bad_input_begins_at_the_actuator() {
+    for (policy, outputs, keeps) in [
+        (OnFault::Hold, 42.0, true),
+        (OnFault::SafeValue, 10.0, false),
+        (OnFault::Manual, 42.0, true),
+    ] {
+        let (mut spec, _) = setup();
+        spec.policy.on_bad_input = policy;
+        let standing = settle(Some(&before()), &spec, &sample(vec![]), &[42.0]);
+        let record = conclude_with(Err(Fault::BadInput("pv".into())), standing, &before(), &spec);
+        assert_eq!(
+            (record.outputs[0], !record.state.is_empty()),
+            (outputs, keeps),
+            "{policy:?}"
+        );
+    }
+}
+
+#[test]
+fn forces_are_told_when_they_begin_and_end_and_an_unknown_actuator_holds_what_was_committed() {
+    let (spec, wiring) = setup();
+    let mut base = before();
+    base.revision = spec.revision;
+    let forced = |value| Reading {
+        quality: Quality::Forced,
+        ..Reading::good(value, 5)
+    };
+    let mut events = vec![];
+    tell_forces(&[forced(4.0), Reading::good(42.0, 5)], Some(&base), &spec, &mut events);
+    assert_eq!(events, [Event::Forced(0)]);
+    base.readings = vec![forced(4.0), forced(42.0)];
+    events.clear();
+    tell_forces(&[forced(4.0), Reading::good(42.0, 5)], Some(&base), &spec, &mut events);
+    assert_eq!(events, [Event::Unforced(1)]);
+    let unread = [Reading::good(4.0, 5), Reading::missing(NoData::NeverRead, 0.0, 0)];
+    assert!(wiring.held(&unread)[0].is_nan());
+    base.outputs = vec![33.0];
+    assert_eq!(wiring.held_since(&unread, Some(&base), spec.revision), [33.0]);
+    assert!(
+        wiring.held_since(&unread, Some(&base), spec.revision + 1)[0].is_nan(),
+        "another revision, perhaps another point"
+    );
+}
+
+#[test]
 fn remembered_outcomes_are_bounded() {
     let (spec, _) = setup();
     let mut standing = settle(Some(&before()), &spec, &sample(vec![]), &[42.0]);

@@ -45,6 +45,8 @@ pub(crate) enum Failure {
     Malformed(String),
     /// The connection is gone, or what comes over it is no Modbus.
     Lost(String),
+    /// Nothing was sent: another host is the device's master.
+    Fenced,
 }
 
 /// A connection.

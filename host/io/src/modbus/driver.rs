@@ -25,6 +25,7 @@ use crate::{
     errand::{Asked, Post},
     image::Image,
     limits::CLOSE_WAIT_MS,
+    master::{Keeper, Mastership},
     status::StatusCell,
 };
 
@@ -36,11 +37,18 @@ pub(crate) struct Shared {
     pub(crate) outbox: Outbox,
     pub(crate) status: StatusCell,
     pub(crate) clock: Clock,
+    /// Of a device with two masters: may this one write? None where there is only one.
+    pub(crate) mastership: Option<Arc<Mastership>>,
     /// One bit for each connection over which a unit answers.
     answering: AtomicU32,
 }
 
 impl Shared {
+    /// May the device be written now?
+    pub(crate) fn may_write(&self) -> bool {
+        self.mastership.as_ref().is_none_or(|mastership| mastership.may_write())
+    }
+
     /// A connection's units answer, or none of them does.
     pub(crate) fn answers(&self, lane: usize, answers: bool) {
         let bit = 1_u32 << lane.min(31);
@@ -60,7 +68,9 @@ impl Shared {
 #[derive(Debug)]
 pub(crate) struct ModbusDriver {
     shared: Arc<Shared>,
+    /// Stops the keeper of the lease, which then stops the links; the links themselves where there is no keeper.
     stop: watch::Sender<bool>,
+    epoch: watch::Receiver<Option<u32>>,
     /// The units, in order; the connection of one is its rank, round robin.
     units: Vec<u8>,
     /// The way of errands to each connection.
@@ -85,6 +95,7 @@ impl ModbusDriver {
             status: StatusCell::new(plan.bus.clone(), plan.way.driver(), false, plan.points.len()),
             clock,
             answering: AtomicU32::new(0),
+            mastership: plan.redundant.as_ref().map(|_| Arc::default()),
             plan,
         });
         let (stop, stopped) = watch::channel(false);
@@ -102,9 +113,29 @@ impl ModbusDriver {
                 link.run().await;
             });
         }
+        let (told, epoch) = watch::channel(None);
+        let mut outer = stop.clone();
+        if let (Some(plan), Some(mastership)) = (&shared.plan.redundant, &shared.mastership)
+            && let Some(post) = posts.get(units.binary_search(&plan.unit_id).unwrap_or(0) % posts.len().max(1))
+        {
+            let keeper = Keeper {
+                plan: plan.clone(),
+                mastership: Arc::clone(mastership),
+                post: post.clone(),
+                timeout_ms: shared.plan.timeout_ms,
+                epoch: told,
+            };
+            let (bus, (stop_keeper, keeper_stopped)) = (shared.plan.bus.to_string(), watch::channel(false));
+            let stop_links = std::mem::replace(&mut outer, stop_keeper);
+            runtime.spawn(async move {
+                keeper.run(&bus, keeper_stopped).await;
+                stop_links.send_replace(true);
+            });
+        }
         Self {
             shared,
-            stop,
+            stop: outer,
+            epoch,
             units,
             posts,
             ended: Mutex::new(ended),
@@ -118,7 +149,8 @@ impl ModbusDriver {
     /// Hands checked values to the tasks.
     pub(crate) fn write(&self, writes: impl Iterator<Item = (usize, f64)>, now_ns: u64) {
         for (point, value) in writes {
-            if let Some(planned) = self.shared.plan.points.get(point) {
+            // Of two masters only one has a say; what the other was told by hand or by force would be old when it takes over.
+            if let Some(planned) = self.shared.plan.points.get(point).filter(|_| self.shared.may_write()) {
                 self.shared.outbox.put(Wish {
                     point,
                     words: encoded(planned, value),
@@ -133,6 +165,16 @@ impl ModbusDriver {
         let rank = self.units.binary_search(&errand.unit_id()).unwrap_or(0);
         let post = self.posts.get(rank % self.posts.len().max(1)).ok_or(Error::Closed)?;
         post.send(&self.shared.plan.bus, errand, until)
+    }
+
+    /// May the device be written by this host now?
+    pub(crate) fn may_write(&self) -> bool {
+        self.shared.may_write()
+    }
+
+    /// The number of the mastership, while this host has it; changes as it goes over. None for a bus with one master.
+    pub(crate) fn epoch(&self) -> Option<watch::Receiver<Option<u32>>> {
+        self.shared.plan.redundant.as_ref().map(|_| self.epoch.clone())
     }
 
     /// What the bus was planned with.

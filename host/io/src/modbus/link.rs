@@ -21,7 +21,7 @@ use std::{
 use bumpless_core::{NoData, Quality};
 use tokio::{
     net::TcpStream,
-    sync::{mpsc, watch},
+    sync::watch,
     time::{Instant, timeout},
 };
 
@@ -32,11 +32,11 @@ use super::{
     exception::Exception,
     group::{Group, Item},
     outbox::{Wish, encoded},
-    plan::Way,
+    plan::{Plan, Way},
     request::{Answer, Request},
     serial::Serial,
 };
-use crate::{config::OnStop, errand::Posted, limits::SILENT_IN_ROW_MAX};
+use crate::{config::OnStop, errand::Errands, limits::SILENT_IN_ROW_MAX};
 
 mod errands;
 mod writes;
@@ -67,7 +67,7 @@ pub(crate) struct Link {
     lane: usize,
     units: Vec<u8>,
     stop: watch::Receiver<bool>,
-    errands: mpsc::Receiver<Posted>,
+    errands: Errands,
     polls: Vec<Poll>,
     backoff: Backoff,
     quiet: HashMap<u8, Quiet>,
@@ -83,7 +83,7 @@ impl Link {
         lane: usize,
         units: Vec<u8>,
         stop: watch::Receiver<bool>,
-        errands: mpsc::Receiver<Posted>,
+        errands: Errands,
     ) -> Self {
         let now = Instant::now();
         let polls = shared
@@ -148,7 +148,7 @@ impl Link {
         let longest = self.time_limit();
         let connected = tokio::select! {
             _ = self.stop.wait_for(|stop| *stop) => return None,
-            connected = timeout(longest, open(&shared.plan.way)) => connected,
+            connected = timeout(longest, open(&shared.plan)) => connected,
         };
         let place = shared.plan.way.place();
         let problem = match connected {
@@ -182,7 +182,7 @@ impl Link {
                 return end;
             }
             // One between two polls, so that neither waits for the other for long.
-            if let Ok(posted) = self.errands.try_recv()
+            if let Some(posted) = self.errands.try_recv()
                 && let Err(end) = self.errand(connection, posted).await
             {
                 return end;
@@ -342,8 +342,25 @@ impl Link {
         }
     }
 
-    /// One request, within its time, and again where it is not answered and may be.
+    /// One request, within its time, and again where it is not answered and may be. Of a device with two masters only the
+    /// master writes; it is asked right before the request, and nowhere earlier: see [`crate::master`].
     async fn request(&self, connection: &mut Connection, unit_id: u8, request: &Request) -> Result<Answer, Failure> {
+        if request.is_write() && !self.shared.may_write() {
+            return Err(Failure::Fenced);
+        }
+        let answer = self.request_unfenced(connection, unit_id, request).await;
+        if request.is_write() {
+            self.note_ended_lease(unit_id);
+        }
+        answer
+    }
+
+    async fn request_unfenced(
+        &self,
+        connection: &mut Connection,
+        unit_id: u8,
+        request: &Request,
+    ) -> Result<Answer, Failure> {
         let mut tries = 0;
         loop {
             let started = Instant::now();
@@ -351,6 +368,8 @@ impl Link {
             let latency_us = u64::try_from(started.elapsed().as_micros()).unwrap_or(u64::MAX);
             let again = matches!(answer, Err(Failure::Silent(_)))
                 && tries < self.shared.plan.retries
+                // The lease is asked for once, and the times of two masters count with one try.
+                && self.shared.mastership.is_none()
                 && connection.outlives_silence()
                 && !self.stopping();
             self.shared.status.update(|s| {
@@ -380,6 +399,10 @@ impl Link {
         match failure {
             Failure::Exception(exception) => {
                 self.report(&format!("{place}: {exception}"));
+                Ok(())
+            }
+            Failure::Fenced => {
+                self.report(&format!("{place}: this host is not the device's master; given up"));
                 Ok(())
             }
             Failure::Lost(problem) => {
@@ -460,8 +483,8 @@ impl Link {
 }
 
 /// A connection, or why there is none, in words.
-async fn open(way: &Way) -> Result<Connection, String> {
-    match way {
+async fn open(plan: &Plan) -> Result<Connection, String> {
+    match &plan.way {
         Way::Line { device, line } => {
             let serial = Serial::open(device, *line).map_err(|error| {
                 format!("{error}; check that the line is there and that this user may use it (group dialout)")
@@ -470,6 +493,9 @@ async fn open(way: &Way) -> Result<Connection, String> {
         }
         Way::Network { address, framing, tls } => {
             let stream = TcpStream::connect(address.as_str()).await.map_err(|e| e.to_string())?;
+            if plan.redundant.is_some() {
+                bound_in_flight(&stream, plan.timeout_ms)?;
+            }
             // Small requests must leave at once. Where the system refuses, they leave a little later.
             let _ = stream.set_nodelay(true);
             let Some(tls) = tls else {
@@ -482,4 +508,13 @@ async fn open(way: &Way) -> Result<Connection, String> {
             Ok(Connection::over_network(stream, *framing))
         }
     }
+}
+
+/// Of a device with two masters: what the network has not delivered within a time-out is given up, by the system too, and a
+/// connection that is dropped takes what it has not sent with it.
+fn bound_in_flight(stream: &TcpStream, timeout_ms: u64) -> Result<(), String> {
+    socket2::SockRef::from(stream)
+        .set_tcp_user_timeout(Some(Duration::from_millis(timeout_ms)))
+        .and_then(|()| stream.set_zero_linger())
+        .map_err(|error| format!("writes on their way cannot be bounded ({error}), so that two masters might overlap"))
 }

@@ -55,6 +55,7 @@ pub(crate) struct Plan {
     pub(crate) on_stop: OnStop,
     pub(crate) unit_id: u8,
     pub(crate) jobs: Vec<JobConfig>,
+    pub(crate) redundant: Option<crate::master::RedundantPlan>,
     pub(crate) points: Vec<PlannedPoint>,
     pub(crate) groups: Vec<group::Group>,
 }
@@ -229,6 +230,14 @@ impl ModbusConfig {
             ));
         }
         job::check_all(&bus, &self.jobs)?;
+        let redundant = self
+            .redundant
+            .as_ref()
+            .map(|redundant| redundant.plan(&bus, self.unit_id, self.timeout_ms))
+            .transpose()?;
+        if redundant.is_some() && transport == Transport::Line {
+            return wrong("a serial line has one master; remove redundant, or put the device on a network".to_owned());
+        }
         let mut points = Vec::with_capacity(self.points.len());
         let mut infos = Vec::with_capacity(self.points.len());
         for point in &self.points {
@@ -266,6 +275,7 @@ impl ModbusConfig {
             on_stop: self.on_stop,
             unit_id: self.unit_id,
             jobs: self.jobs.clone(),
+            redundant,
             points,
             groups,
         };

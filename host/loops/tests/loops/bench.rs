@@ -220,6 +220,7 @@ impl Bench {
                 HomeRevision {
                     spec: Arc::new(first),
                     wiring,
+                    term_floor: 0,
                 },
                 None,
             )
@@ -365,6 +366,7 @@ impl Bench {
         let revision = HomeRevision {
             spec: Arc::new(spec.clone()),
             wiring: self.wiring(spec),
+            term_floor: 0,
         };
         self.at(&self.home).add_home_revision(revision).unwrap();
         self.command(CommandBody::Revise(spec.revision))

@@ -8,13 +8,24 @@ use crate::errand::{Errand, ErrandError, Posted};
 impl Link {
     /// One errand. Its asker may be gone, or its time over: then nothing is sent.
     pub(super) async fn errand(&mut self, connection: &mut Connection, posted: Posted) -> Result<(), End> {
-        let Posted { errand, until, reply } = posted;
+        let Posted {
+            errand,
+            of_lease,
+            until,
+            reply,
+        } = posted;
         if reply.is_closed() || std::time::Instant::now() >= until {
             let _ = reply.send(Err(ErrandError::NoTurn));
             return Ok(());
         }
         let unit_id = errand.unit_id();
-        let (answer, end) = match self.request(connection, unit_id, &request(&errand)).await {
+        let request = request(&errand);
+        let answer = if of_lease {
+            self.request_unfenced(connection, unit_id, &request).await
+        } else {
+            self.request(connection, unit_id, &request).await
+        };
+        let (answer, end) = match answer {
             Ok(answer) => {
                 self.answered(unit_id);
                 let words = match answer {
@@ -34,6 +45,7 @@ impl Link {
                     Failure::Silent(_) => ErrandError::NoAnswer(self.shared.plan.timeout_ms),
                     Failure::Lost(problem) | Failure::Malformed(problem) => ErrandError::Lost(problem.clone()),
                     Failure::Exception(exception) => ErrandError::Lost(exception.to_string()),
+                    Failure::Fenced => ErrandError::NotMaster,
                 };
                 (Err(error), self.failed(connection, unit_id, &errand.place(), failure))
             }
@@ -41,6 +53,18 @@ impl Link {
         // Nobody waits any more: that is the asker's matter.
         let _ = reply.send(answer);
         end
+    }
+
+    /// A write that ended after the lease may have been sent after it: no look beforehand can exclude that the process was
+    /// stopped between the look and the write. So it is told.
+    pub(super) fn note_ended_lease(&self, unit_id: u8) {
+        if let Some(mastership) = &self.shared.mastership
+            && !mastership.may_write()
+        {
+            self.report(&format!(
+                "unit {unit_id}: the lease ended before a write was answered; it may have come too late"
+            ));
+        }
     }
 }
 

@@ -42,6 +42,11 @@ impl Link {
                             .set(wish.point, Err(NoData::DeviceError(exception.0)), Quality::Bad, now_ns);
                     }
                 }
+                Err(failure @ Failure::Fenced) => {
+                    // Whoever is master has its own wishes; these would be old when this host is it again.
+                    let place = format!("write to {}", self.place(&batch));
+                    self.failed(connection, batch.unit_id, &place, failure)?;
+                }
                 Err(failure) => {
                     batch.wishes.iter().for_each(|wish| self.shared.outbox.put_back(wish));
                     let place = format!("write to {}", self.place(&batch));

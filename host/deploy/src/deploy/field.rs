@@ -1,0 +1,93 @@
+//! The facade's part about points, buses, forces and jobs.
+//!
+//! Never: decides; the host of the point or bus does.
+
+use bumpless_core::PointId;
+use tokio::sync::broadcast;
+
+use super::Deploy;
+use crate::{
+    commissioning::{BusView, FieldEvent, ForceDraft, JobDraft, JobView},
+    error::Error,
+    view::PointView,
+};
+
+impl Deploy {
+    /// One point, as its I/O host sees it.
+    ///
+    /// # Errors
+    /// [`Error::NotFound`], [`Error::Unreachable`], [`Error::Timeout`].
+    pub async fn point(&self, point: &PointId) -> Result<PointView, Error> {
+        self.room.point(point).await
+    }
+
+    /// Writes a point that no loop writes and nobody forces.
+    ///
+    /// # Errors
+    /// [`Error::NotFound`], [`Error::Invalid`] for a value that the point does not take, [`Error::Refused`] by a loop or a
+    /// force, [`Error::Unreachable`], [`Error::Timeout`].
+    pub async fn write_point(&self, point: &PointId, value: f64, by: String) -> Result<PointView, Error> {
+        self.room.write_point(point, value, by).await
+    }
+
+    /// Holds a point at a value for a time, over takeovers of its loop and restarts of its host.
+    ///
+    /// # Errors
+    /// As [`Deploy::write_point`], [`Error::Store`].
+    pub async fn force(&self, point: &PointId, draft: ForceDraft) -> Result<PointView, Error> {
+        self.room.force(point, draft).await
+    }
+
+    /// Lets a point go before its time.
+    ///
+    /// # Errors
+    /// [`Error::Refused`] where it is not forced, else as [`Deploy::point`].
+    pub async fn unforce(&self, point: &PointId, by: String) -> Result<PointView, Error> {
+        self.room.unforce(point, by).await
+    }
+
+    /// The buses of all hosts, by name.
+    ///
+    /// # Errors
+    /// Where no I/O host answers.
+    pub async fn buses(&self) -> Result<Vec<BusView>, Error> {
+        self.room.buses().await
+    }
+
+    /// Hands a job to the host of its bus. Returns when it was taken in; what becomes of it is for [`Deploy::job`] and
+    /// [`Deploy::field_events`].
+    ///
+    /// # Errors
+    /// [`Error::Busy`] where too many wait, [`Error::Refused`] in the way of a loop, [`Error::NotFound`],
+    /// [`Error::Invalid`], [`Error::Unreachable`], [`Error::Timeout`].
+    pub async fn start_job(&self, draft: JobDraft) -> Result<JobView, Error> {
+        self.room.start_job(draft).await
+    }
+
+    /// The jobs of all hosts, oldest first, without their results.
+    pub async fn jobs(&self) -> Vec<JobView> {
+        self.room.jobs().await
+    }
+
+    /// One job with its result.
+    ///
+    /// # Errors
+    /// [`Error::NotFound`], [`Error::Unreachable`], [`Error::Timeout`].
+    pub async fn job(&self, id: &str) -> Result<JobView, Error> {
+        self.room.job(id).await
+    }
+
+    /// Ends a job: at once while it waits, between two requests while it runs.
+    ///
+    /// # Errors
+    /// [`Error::Refused`] where it has ended, else as [`Deploy::job`].
+    pub async fn cancel_job(&self, id: &str, by: String) -> Result<JobView, Error> {
+        self.room.cancel_job(id, by).await
+    }
+
+    /// What happens to points and jobs. A receiver that lags loses the oldest.
+    #[must_use]
+    pub fn field_events(&self) -> broadcast::Receiver<FieldEvent> {
+        self.room.commissioning.subscribe()
+    }
+}
