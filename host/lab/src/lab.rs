@@ -16,7 +16,7 @@ use std::{
 
 use bumpless_core::{Descriptor, Digest, Direction, LoopId, LoopSpec, OutputLimit, PointId, Wiring};
 use bumpless_engine::Prepared;
-use bumpless_io::sim::{FopdtSettings, LinearSettings, Model, PlantSettings, Stock, model::stock};
+use bumpless_io::sim::{Model, Stock, model::stock};
 
 use crate::{
     error::Error,
@@ -316,9 +316,9 @@ impl Lab {
         let p = &experiment.plant;
         let made = |which: Stock| stock(&which, seed).map_err(|problem| Error::at("[plant]", problem));
         match p.model.as_str() {
-            "pilot" => made(Stock::Pilot(p.pilot.unwrap_or_else(PlantSettings::default))),
-            "fopdt" => made(Stock::Fopdt(p.fopdt.unwrap_or_else(FopdtSettings::default))),
-            "linear" => made(Stock::Linear(p.linear.clone().unwrap_or_else(LinearSettings::default))),
+            "pilot" => made(Stock::Pilot(p.pilot.unwrap_or_default())),
+            "fopdt" => made(Stock::Fopdt(p.fopdt.unwrap_or_default())),
+            "linear" => made(Stock::Linear(p.linear.clone().unwrap_or_default())),
             "recorded" => {
                 let file = p.recorded.as_ref().map_or("", |r| r.file.as_str());
                 Ok(Box::new(RecordedModel::new(&Window::read(&base.join(file))?)))
@@ -399,7 +399,7 @@ impl Lab {
         model: &dyn Model,
         base: &Path,
         place: &str,
-    ) -> Result<(Arc<LoopSpec>, Arc<Prepared>, HashMap<String, usize>), Error> {
+    ) -> Result<Resolved, Error> {
         let wrong = |problem: String| Error::at(place, problem);
         let prepared = self.library.controller(&located(&controller.component, base))?;
         let descriptor = prepared.descriptor();
@@ -502,6 +502,9 @@ impl Lab {
         Ok(Digest::of(text.as_bytes()))
     }
 }
+
+/// One controller of a loop, resolved: what is run, its component, and the signals by name.
+type Resolved = (Arc<LoopSpec>, Arc<Prepared>, HashMap<String, usize>);
 
 /// An experiment, resolved.
 struct Setup {

@@ -160,7 +160,7 @@ impl Experiment {
         }
         for event in &self.events {
             let place = format!("event at {} s", event.at_s());
-            if !(event.at_s() >= 0.0) {
+            if event.at_s().is_nan() || event.at_s() < 0.0 {
                 return wrong(place, "at_s must be 0 or more");
             }
             let known = |host: &String| host == "owner" || self.cell.hosts.iter().any(|h| h.name == *host);
@@ -178,7 +178,7 @@ impl Experiment {
                 | Event::Kill {
                     back_after_s: Some(time_s),
                     ..
-                } if !(*time_s > 0.0) => {
+                } if time_s.is_nan() || *time_s <= 0.0 => {
                     return wrong(place, "a time must be greater than 0 s");
                 }
                 Event::Load { cpu, .. } if !(0.0..=1.0).contains(cpu) => return wrong(place, "cpu must be 0 to 1"),

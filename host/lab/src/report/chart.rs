@@ -38,7 +38,7 @@ fn color(ink: &Ink) -> RGBColor {
 }
 
 fn words(size: u32) -> TextStyle<'static> {
-    TextStyle::from(("sans-serif", size).into_font().color(&color(&TEXT)))
+    ("sans-serif", size).into_font().color(&color(&TEXT))
 }
 
 fn drawn<'a, E: std::error::Error + Send + Sync>(what: &'a str) -> impl Fn(DrawingAreaErrorKind<E>) -> Error + 'a {

@@ -322,14 +322,14 @@ fn curves(
             let Some(run) = v.runs.first() else { continue };
             let rows: Vec<(f64, u8)> = trace(v).iter().filter(|r| r.by > 0).map(|r| (r.t_s, r.by)).collect();
             if run.hosts.len() > 2 && !rows.is_empty() {
-                let _infallible = write!(page, "<h3>{}</h3>\n", escaped(&v.case));
+                let _infallible = writeln!(page, "<h3>{}</h3>", escaped(&v.case));
                 page.push_str(&chart::steppers(&run.hosts, &rows, chart::ink(*place), end_s)?);
             }
         }
         if !notes.is_empty() {
             page.push_str("<h3>What happened</h3><ul>\n");
             for note in notes.iter().take(40) {
-                let _infallible = write!(page, "<li>{} s: {}</li>\n", number(note.at_s), escaped(&note.text));
+                let _infallible = writeln!(page, "<li>{} s: {}</li>", number(note.at_s), escaped(&note.text));
             }
             page.push_str("</ul>\n");
         }
