@@ -308,40 +308,6 @@ fn of(record: &Record, ports: &PortTable) -> Vec<(Weight, &'static str, String, 
                 ports.name(usize::from(*port)),
                 format!("input {} is bad", ports.name(usize::from(*port))),
             ),
-            Event::RedundancyLost { have, want } => (
-                Weight::Warning,
-                "redundancy-lost",
-                String::new(),
-                format!("only {have} of {want} replicas can step"),
-            ),
-            Event::RedundancyRestored { want } => (
-                Weight::Info,
-                "redundancy-restored",
-                String::new(),
-                format!("all {want} replicas can step again"),
-            ),
-            Event::Dissent { replica } => (
-                Weight::Urgent,
-                "dissent",
-                replica.to_string(),
-                format!("the step on {replica} was not what the majority's was: it has no vote until further notice"),
-            ),
-            Event::Readmitted { replica } => (
-                Weight::Info,
-                "readmitted",
-                replica.to_string(),
-                format!("{replica} has a vote again"),
-            ),
-            Event::NoMajority {
-                answers,
-                agreed,
-                needed,
-            } => (
-                Weight::Urgent,
-                "no-majority",
-                String::new(),
-                format!("{agreed} of {answers} answers were equal; {needed} are needed"),
-            ),
         });
     }
     for alarm in &record.alarms {
