@@ -189,7 +189,7 @@ impl Cell {
         for host in self.hosts().filter(|host| host.name != but) {
             match &self.relay {
                 Some(relay) if relayed == Some(but) && host.name == PLANT => {
-                    known.push(format!("tcp/{}", relay.address))
+                    known.push(format!("tcp/{}", relay.address));
                 }
                 Some(_) if but == PLANT && relayed == Some(host.name.as_str()) => {}
                 _ => known.extend(host.cell.iter().cloned()),

@@ -248,7 +248,7 @@ impl Inflictor {
                 (victim, others)
             }
         };
-        let outwards = fault.choice / 3 % 2 == 0;
+        let outwards = (fault.choice / 3).is_multiple_of(2);
         let mut pairs = Vec::new();
         for other in others.iter().filter(|other| **other != victim) {
             if !one_way || outwards {

@@ -159,7 +159,7 @@ fn operations() -> Vec<(&'static str, Value, Value)> {
     let bits = |values: &[u8]| json!({ "values": values });
     let words = |values: &[u16]| json!({ "values": values });
     let done = || json!({ "done": true });
-    let on = |n: usize| u16::from(n % 3 == 0);
+    let on = |n: usize| u16::from(n.is_multiple_of(3));
     let many: Vec<u16> = (0..2000).map(on).collect();
     let long: Vec<u16> = (0..1968).map(|n| u16::from(n % 5 == 0)).collect();
     let block: Vec<u16> = (0..123).map(|n| 60_000 + n).collect();

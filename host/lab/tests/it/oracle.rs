@@ -96,7 +96,7 @@ fn text(known: &Known, component: &str) -> String {
     let period_ms = known.step * scale * 1e3;
     let plant = known
         .plant
-        .split_inclusive(|c: char| c == ',' || c == '[' || c == ']' || c == ' ')
+        .split_inclusive([',', '[', ']', ' '])
         .map(|part| {
             let end = part.len() - usize::from(part.ends_with([',', ']', '[', ' ']));
             match part[..end].parse::<f64>() {
