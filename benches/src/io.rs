@@ -138,7 +138,7 @@ fn run_room(ports: &[u16], lasts: Duration) -> Result<Run, Error> {
     let mut others: Vec<PointIndex> = Vec::new();
     for device in 1..ports.len() {
         for number in 0..POINTS_PER_DEVICE {
-            others.extend(server.index(&PointId::new(&format!("d{device}.{number}"))?));
+            others.extend(server.index(&PointId::new(format!("d{device}.{number}"))?));
         }
     }
     let all_read = || {

@@ -7,7 +7,7 @@ use std::{path::Path, time::Instant};
 
 use bumpless_engine::{Config, Engine};
 use bumpless_io::sim::{PlantSettings, Stock, model::stock};
-use bumpless_isa::{Demand, Memory, Sample};
+use bumpless_isa::{Memory, Sample};
 use bumpless_lab::{Experiment, Lab, Library};
 
 use crate::{Options, error::Error, law, report::Bound, report::Report, spread::median, stall::Watch};
@@ -56,15 +56,7 @@ fn native(duration_s: u64) -> Result<f64, Error> {
         let shown = model.shown(pv);
         let output = memory.step(
             &tuning,
-            &Sample {
-                pv: shown,
-                setpoint,
-                feedforward: 0.0,
-                held: Some(model.truth(out)),
-                demand: Demand::Automatic,
-                dt_s,
-                elapsed_s: Some(dt_s),
-            },
+            &Sample::automatic(shown, setpoint, Some(model.truth(out)), dt_s),
         );
         iae += (setpoint - model.truth(pv)).abs() * dt_s;
         model.set(out, output);

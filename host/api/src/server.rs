@@ -63,6 +63,9 @@ impl Default for Options {
     }
 }
 
+/// A text and when it was made.
+pub(crate) type Standing = (Instant, Arc<str>);
+
 /// What every route may use.
 #[derive(Clone)]
 pub(crate) struct App {
@@ -77,7 +80,7 @@ pub(crate) struct App {
     /// What people should hear of.
     pub(crate) notices: Arc<Notices>,
     /// Where all loops stand, as JSON, and since when that is known.
-    pub(crate) standing: Arc<Mutex<Option<(Instant, Arc<str>)>>>,
+    pub(crate) standing: Arc<Mutex<Option<Standing>>>,
     /// Who does the faults of the demonstration.
     pub(crate) faults: Option<mpsc::Sender<Fault>>,
     requests: Arc<Semaphore>,

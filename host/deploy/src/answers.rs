@@ -28,7 +28,7 @@ impl Room {
                 Ask::Command(id, command) => self.command_here(&id, command).await.map(Told::Commanded),
                 Ask::Delete(id) => self.delete_here(id).await.map(|()| Told::Done),
                 Ask::Drain(order) => self.drain_here(order).await.map(Told::Drained),
-                Ask::Move(id, to) => self.move_here(&id, to).map(|()| Told::Done),
+                Ask::Move(id, to) => self.move_here(&id, &to).map(|()| Told::Done),
                 Ask::Try(spec) => self.try_here(&from, *spec).await,
                 Ask::Hold(intent, revision) => self.hold_here(&from, *intent, revision).await,
                 Ask::Held { came, went, afresh } => {

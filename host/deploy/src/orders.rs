@@ -153,11 +153,11 @@ impl Room {
     }
 
     /// Gives the ownership to another member.
-    pub(crate) fn move_here(&self, id: &LoopId, to: HostId) -> Result<(), Error> {
+    pub(crate) fn move_here(&self, id: &LoopId, to: &HostId) -> Result<(), Error> {
         let intent = self.ours(id)?;
         let members = self.homes.members(id);
         let revision = intent.current.revision;
-        if !members.contains(&to) || !self.homes.is_ready(&to, id, revision) {
+        if !members.contains(to) || !self.homes.is_ready(to, id, revision) {
             let ready: Vec<_> = members
                 .iter()
                 .filter(|host| self.homes.is_ready(host, id, revision))
@@ -176,7 +176,7 @@ impl Room {
         self.field
             .move_to(id, to.clone())
             .map_err(|error| Error::busy(chain(&error), ""))?;
-        self.homes.moved(id, &to);
+        self.homes.moved(id, to);
         Ok(())
     }
 }

@@ -71,7 +71,7 @@ impl Deploy {
                 Err(error) => tracing::warn!(%host, %error, "a host's alarms are missing from the list"),
             }
         }
-        past.sort_by(|a, b| b.change.at_ns.cmp(&a.change.at_ns));
+        past.sort_by_key(|event| std::cmp::Reverse(event.change.at_ns));
         past.truncate(max as usize);
         Ok(past)
     }
