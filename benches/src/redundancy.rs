@@ -264,7 +264,7 @@ mod tests {
             .collect();
         let counts: Vec<f64> = replicas(&records).iter().map(|(_, n)| *n).collect();
         assert_eq!(counts.len(), 20);
-        assert_eq!((counts[0], counts[13], counts[19]), (2.0, 2.0, 1.0));
+        assert_eq!((counts[0], counts[12], counts[13], counts[19]), (2.0, 2.0, 1.0, 1.0));
     }
 
     #[test]

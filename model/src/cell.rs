@@ -17,7 +17,7 @@ use std::{
 
 use bumpless_core::{
     Command, CommandBody, CommandId, Event, HostId, Outcome, Record, Redundancy,
-    desk::{Desk, Dispatch},
+    desk::{Desk, Dispatch, TERMS_SKIPPED_AT_RESTART},
     protocol::{Answer, Refusal, Sample},
     seat::{self, Base, Conclusion, Stepped},
     swap,
@@ -506,6 +506,10 @@ impl Cell {
         let floor = last.clone().filter(|_| self.broken != Some(Broken::TermsAgain));
         let members = state.desk.members().to_vec();
         state.desk = Desk::new(home_id(), Arc::clone(&law.spec), floor, state.now_ns, 0);
+        if self.broken != Some(Broken::TermsAgain) {
+            // A home that comes back knows the loop from its disk, even where it left no record.
+            state.desk.raise_terms(TERMS_SKIPPED_AT_RESTART);
+        }
         let _nothing = state.desk.set_members(state.now_ns, members);
     }
 

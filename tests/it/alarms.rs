@@ -78,7 +78,9 @@ fn an_alarm_lives_by_the_process_and_by_people_and_outlives_its_host() {
         (&json!("ann"), &json!("known"), &json!(1))
     );
 
-    api.setpoint(LOOP, 40.0).unwrap();
+    // The home opens once it has asked the others for newer records.
+    api.wait_until("the home is open", |api| api.setpoint(LOOP, 40.0))
+        .unwrap();
     alarm(&api, "high", "latched");
     let reset = api.post(&path, &json!({ "act": "reset", "by": "ann" })).unwrap();
     assert_eq!(reset["state"], "normal");

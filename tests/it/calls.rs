@@ -112,7 +112,12 @@ fn bad_calls_are_refused(api: &Api) {
         ("pid", |c| c["parameters"]["k"] = json!(-1), 422, "\"k\""),
         ("pid", |c| c["parameters"]["speed"] = json!(1), 422, "\"speed\""),
         ("pid", |c| c["dt_ms"] = json!(0), 422, "greater than 0"),
-        ("pid", |c| c["strategy"] = json!("best"), 422, "unknown variant `best`"),
+        (
+            "pid",
+            |c| c["strategy"] = json!("best"),
+            422,
+            "strategy \"best\" is unknown",
+        ),
         ("pid", |c| c["speed"] = json!(1), 422, "unknown field `speed`"),
     ];
     for (component, change, status, part) in table {

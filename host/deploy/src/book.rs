@@ -3,7 +3,10 @@
 //! Owns: that what is in memory is on disk first, and that a newer copy wins wherever it comes from.
 //! Never: decides what shall run.
 
-use std::{collections::BTreeMap, sync::Arc};
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    sync::Arc,
+};
 
 use bumpless_core::{HostId, Intent, LoopId, PointId};
 use bumpless_store::{Store, Tombstone};
@@ -86,6 +89,8 @@ impl Pages {
 pub(crate) struct Book {
     store: Store,
     pages: RwLock<Pages>,
+    /// Loops that the disk knew when this host started.
+    from_disk: BTreeSet<LoopId>,
 }
 
 impl Book {
@@ -100,8 +105,14 @@ impl Book {
         }
         Ok(Self {
             store,
+            from_disk: pages.intents.keys().cloned().collect(),
             pages: RwLock::new(pages),
         })
+    }
+
+    /// Did the disk know the loop when this host started? Then it may have had an owner in an earlier life of this host.
+    pub(crate) fn was_there(&self, id: &LoopId) -> bool {
+        self.from_disk.contains(id)
     }
 
     pub(crate) fn get(&self, id: &LoopId) -> Option<Arc<Intent>> {

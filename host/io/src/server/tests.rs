@@ -486,7 +486,7 @@ fn configurations_that_are_shown_to_people_work() {
     ] {
         texts.extend(shown(source));
     }
-    assert_eq!(texts.len(), 6);
+    assert_eq!(texts.len(), 7);
     for text in texts {
         let text = text.replace("\"writes.csv\"", &format!("{journal:?}"));
         let server = open(&text).unwrap_or_else(|error| panic!("{text}\n{error}"));

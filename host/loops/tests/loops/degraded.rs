@@ -71,7 +71,14 @@ fn with_nobody_left_the_output_holds_the_cycles_are_counted_and_the_next_host_go
     bench.set_members(&[host("b")]);
     let after = bench.until("it goes on", |r| r.seq > before.seq + 5);
     assert_eq!(after.owner, host("b"));
-    let held = after.readings.last().map(bumpless_core::Reading::value_or_last);
+    let prepared = bench.engine.prepared(&after.digest).unwrap();
+    let out = prepared
+        .descriptor()
+        .ports
+        .iter()
+        .position(|port| port.name == "out")
+        .unwrap();
+    let held = after.readings.get(out).map(bumpless_core::Reading::value_or_last);
     let last = bench.seen.iter().rev().find(|r| r.term != after.term).unwrap();
     assert!(
         held.is_some_and(|held| (held - last.outputs[0]).abs() < 0.01),

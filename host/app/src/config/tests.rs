@@ -1,0 +1,171 @@
+//! Configurations that are taken, and those that are refused in words.
+
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "tests")]
+
+use super::*;
+
+const LEAST: &str = "host = \"a\"\n[cell]\nname = \"demo\"\n";
+
+fn parse(text: &str) -> Result<Config, Error> {
+    Config::parse(text, Path::new("/etc/bumpless/host.toml"))
+}
+
+#[test]
+fn the_least_file_is_a_control_host_on_loopback() {
+    let config = parse(LEAST).expect("a good file");
+    assert_eq!((config.io, config.control), (false, true));
+    assert_eq!(config.api_listen.to_string(), "127.0.0.1:8480");
+    assert_eq!(config.data, Path::new("/etc/bumpless/data"));
+    assert_eq!(config.cell.listen, ["tcp/127.0.0.1:0"]);
+    assert_eq!(config.cell.lease_ms, 10_000);
+    assert_eq!(
+        config.engine.limits.memory_bytes_max,
+        bumpless_engine::Limits::default().memory_bytes_max
+    );
+    assert_eq!(
+        config.engine.limits.compile_memory_bytes_max,
+        bumpless_engine::Limits::default().compile_memory_bytes_max
+    );
+    assert!(matches!(config.engine.compile, bumpless_engine::Compile::Child { .. }));
+    assert_eq!(config.history_bytes_max, Some(512 * 1024 * 1024));
+}
+
+#[test]
+fn a_full_file_is_taken_as_it_stands() {
+    let text = r#"
+        host = "plant"
+        data = "/var/lib/bumpless"
+        [cell]
+        name = "demo"
+        listen = ["tcp/10.0.0.1:7447"]
+        connect = ["tcp/10.0.0.2:7447"]
+        scouting = true
+        lease_ms = 300
+        [api]
+        listen = "[::1]:80"
+        [roles]
+        control = true
+        [[bus]]
+        id = "plant"
+        driver = "sim"
+        journal = "writes.csv"
+        [engine]
+        instances_max = 5
+        compile = "in-process"
+        [loops]
+        workers = 3
+        [history]
+        enabled = false
+    "#;
+    let config = parse(text).expect("a good file");
+    assert_eq!((config.io, config.control), (true, true));
+    assert_eq!(config.data, Path::new("/var/lib/bumpless"));
+    assert_eq!((config.cell.lease_ms, config.cell.scouting), (300, true));
+    assert_eq!((config.loops.workers, config.history_bytes_max), (3, None));
+    assert!(matches!(config.engine.compile, bumpless_engine::Compile::InProcess));
+    let BusConfig::Sim(sim) = &config.buses.buses[0] else {
+        panic!("a simulated bus")
+    };
+    assert_eq!(sim.journal.as_deref(), Some(Path::new("/etc/bumpless/writes.csv")));
+}
+
+#[test]
+fn bad_files_say_where_and_what_helps() {
+    let bus = "[[bus]]\nid = \"plant\"\ndriver = \"sim\"\n";
+    let table: [(String, &[&str]); 23] = [
+        (
+            format!("{LEAST}[testing]\nflip_bits_every = 5"),
+            &["key testing", "cell demo may be a real one", "begins with \"test\""],
+        ),
+        (
+            "host = \"a\"\n[cell]\nname = \"test-1\"\n[testing]\nflip_bits_every = 0".into(),
+            &["key testing.flip_bits_every", "it is 0"],
+        ),
+        (
+            "host = \"a\"\nlabels = [\"East\"]\n[cell]\nname = \"demo\"".into(),
+            &["key labels", "\"East\" is no label", "lower-case"],
+        ),
+        (
+            "host = \"a\"\nclock_offset_s = -99999999\n[cell]\nname = \"demo\"".into(),
+            &["key clock_offset_s", "a year, either way"],
+        ),
+        (String::new(), &["host.toml", "missing field `host`"]),
+        (
+            "host = \"A\"\n[cell]\nname = \"demo\"".into(),
+            &["line 1, key host", "'A'", "lower-case"],
+        ),
+        (
+            "host = \"a\"\ncell = \"demo\"".into(),
+            &["line 2, key cell", "CellTable"],
+        ),
+        (
+            format!("{LEAST}lease = 5"),
+            &["line 4, key lease", "unknown field `lease`", "`lease_ms`"],
+        ),
+        (
+            format!("{LEAST}lease_ms = 5"),
+            &["key cell", "lease_ms", "between 100 and 60000"],
+        ),
+        (
+            format!("{LEAST}listen = [\"quic/x:1\"]"),
+            &["key cell", "use tcp or unixsock-stream"],
+        ),
+        (
+            format!("{LEAST}[api]\nlisten = \"localhost\""),
+            &["line 5, key listen", "invalid socket address"],
+        ),
+        (
+            format!("{LEAST}[roles]\nio = true"),
+            &["key roles.io", "add one, or set io = false"],
+        ),
+        (
+            format!("{LEAST}[roles]\ncontrol = false"),
+            &["key roles", "set io or control"],
+        ),
+        (
+            format!("{LEAST}{bus}[roles]\nio = false"),
+            &["key roles.io", "remove them"],
+        ),
+        (
+            format!("{LEAST}{bus}{bus}"),
+            &["key bus.id", "two buses are named plant"],
+        ),
+        (
+            format!("{LEAST}[[bus]]\nid = \"x\"\ndriver = \"opc\""),
+            &["unknown variant `opc`", "modbus-tcp"],
+        ),
+        (
+            format!("{LEAST}[engine]\ninstances_max = 0"),
+            &["key engine.instances_max", "it is 0; use 1 to 100000"],
+        ),
+        (
+            format!("{LEAST}[engine]\ncompile = \"jit\""),
+            &["line 5, key compile", "`child` or `in-process`"],
+        ),
+        (
+            format!("{LEAST}[loops]\nworkers = 65"),
+            &["key loops.workers", "1 to 64"],
+        ),
+        (
+            format!("{LEAST}[loop]\nworkers = 2"),
+            &["line 4", "unknown field `loop`", "`loops`"],
+        ),
+        (
+            format!("{LEAST}[history]\nbytes_max_mib = 15"),
+            &["key history.bytes_max_mib", "it is 15; use 16 to 65536"],
+        ),
+        (
+            format!("{LEAST}[history]\nbytes = 15"),
+            &["line 5, key bytes", "unknown field `bytes`", "`bytes_max_mib`"],
+        ),
+        (format!("{LEAST}[[["), &["line 4"]),
+    ];
+    for (text, parts) in table {
+        let error = parse(&text).expect_err(&text).to_string();
+        for part in parts {
+            assert!(error.contains(part), "{text:?}: {part:?} is missing in: {error}");
+        }
+    }
+    let missing = Config::read(Path::new("/nowhere/host.toml"), None).expect_err("no such file");
+    assert!(missing.to_string().contains("/nowhere/host.toml"), "{missing}");
+}
