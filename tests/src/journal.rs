@@ -240,11 +240,13 @@ impl Journal {
     }
 }
 
-/// The time that differs by whole days and lies within the day after `near_ns`.
+/// The time that differs by whole days and lies within half a day of `near_ns`.
 pub(crate) fn same_day(at_ns: u64, near_ns: u64) -> u64 {
     const DAY_NS: u64 = 86_400_000_000_000;
-    let after_ns = (i128::from(at_ns) - i128::from(near_ns)).rem_euclid(i128::from(DAY_NS));
-    near_ns.saturating_add(u64::try_from(after_ns).unwrap_or(0))
+    // Half a day before to half a day after: what was written before `near_ns` stays before it.
+    let (day_ns, half_ns) = (i128::from(DAY_NS), i128::from(DAY_NS / 2));
+    let away_ns = (i128::from(at_ns) - i128::from(near_ns) + half_ns).rem_euclid(day_ns) - half_ns;
+    u64::try_from(i128::from(near_ns) + away_ns).unwrap_or(near_ns)
 }
 
 /// One line's write and what stands after it.

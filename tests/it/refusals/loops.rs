@@ -104,7 +104,7 @@ pub(super) fn bad_drafts(api: &Api) {
             "unknown strategy",
             |d| d["strategy"] = json!("best"),
             422,
-            "unknown variant `best`",
+            "strategy \"best\" is unknown",
         ),
         (
             "takeover before hedge",
