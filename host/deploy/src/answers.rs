@@ -37,7 +37,6 @@ impl Room {
                     Ok(Told::Holds(holds))
                 }
                 Ask::Find(points) => Ok(Told::Found(points.iter().map(|point| self.speaks_for(point)).collect())),
-                Ask::Put(point, value, by) => self.put_here(&point, value, &by).map(|()| Told::Done),
                 Ask::Read(points) => Ok(self.read_here(&points)),
                 Ask::Points(first) => Ok(self.points_here(first)),
                 Ask::Bytes(digest) => {

@@ -91,8 +91,6 @@ pub(crate) enum Ask {
     Alarm(AlarmAsk),
     /// To an I/O host: these points now, at most a page of them.
     Read(Vec<PointId>),
-    /// To an I/O host: a value for a point that no loop writes, and who wants it.
-    Put(PointId, f64, String),
 }
 
 /// What may be asked about alarms.

@@ -54,7 +54,7 @@ impl Plant for Deploy {
 
     fn write_point(&self, point: PointId, value: f64, by: String) -> Later<Result<(), Error>> {
         let deploy = self.clone();
-        Box::pin(async move { deploy.put_point(&point, value, by).await })
+        Box::pin(async move { deploy.write_point(&point, value, by).await.map(drop) })
     }
 }
 
