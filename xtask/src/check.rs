@@ -1,7 +1,7 @@
 //! `cargo xtask test`: everything that has to hold, in the order in which a fault shows soonest.
 //!
 //! ```text
-//!   tools ─► format ─► dependencies ─► components ─► page ─► clippy ─► build ─► tests ─► documentation
+//!   tools ─► format ─► dependencies ─► components ─► page ─► clippy ─► build ─► tests ─► page in a browser ─► documentation
 //! ```
 //! Owns the list of steps and what each needs set up. One step after the other: they share one target folder and two
 //! cores. The first that fails ends the run. Never: changes a source file.
@@ -16,7 +16,7 @@ use crate::{
 /// A step: name, whether the quick run has it, and what it does.
 type Step = (&'static str, bool, fn(fast: bool) -> Result<(), Error>);
 
-const STEPS: [Step; 9] = [
+const STEPS: [Step; 10] = [
     ("tools", true, |_| tools()),
     ("format", true, |_| run(&mut cargo("fmt --all --check"))),
     ("dependencies", false, |_| deny::check()),
@@ -32,8 +32,9 @@ const STEPS: [Step; 9] = [
         run(&mut cargo("build --workspace --all-targets --quiet"))
     }),
     ("tests", true, tests),
+    ("page in a browser", false, |_| page::test()),
     ("documentation", false, |_| {
-        run(&mut cargo("doc --workspace --no-deps --quiet"))
+        run(cargo("doc --workspace --no-deps --quiet").env("RUSTDOCFLAGS", "--deny warnings"))
     }),
 ];
 
