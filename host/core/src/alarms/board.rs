@@ -181,6 +181,8 @@ impl Board {
             .into_iter()
             .map(|(name, kind, priority)| {
                 let definition = Definition {
+                    // A new loop's hosts still get their component, and a host may start again: lost is what stays away.
+                    on_delay_s: if kind == Kind::RedundancyLost { SETTLED_S } else { 0.0 },
                     off_delay_s: SETTLED_S,
                     ..Definition::new(name, kind, priority)
                 };
