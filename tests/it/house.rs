@@ -16,7 +16,7 @@ use serde_json::Value;
 const LINES_MAX: usize = 600;
 
 /// What each room may use of the others. Nothing imports upwards; `io engine store cell` never import each other.
-const ROOMS: [(&str, &[&str]); 35] = [
+const ROOMS: [(&str, &[&str]); 36] = [
     ("bumpless-core", &[]),
     ("bumpless-io", &["bumpless-core"]),
     ("bumpless-engine", &["bumpless-core"]),
@@ -53,8 +53,10 @@ const ROOMS: [(&str, &[&str]); 35] = [
             "bumpless-api",
             "bumpless-lab",
             "bumpless-scada",
+            "bumpless-telemetry",
         ],
     ),
+    ("bumpless-telemetry", &[]),
     ("bumpless-sdk", &[]),
     ("bumpless-isa", &["bumpless-sdk"]),
     ("bumpless-pid", &["bumpless-isa", "bumpless-sdk"]),
@@ -82,13 +84,16 @@ const ROOMS: [(&str, &[&str]); 35] = [
 ];
 
 /// Third parties that are confined like rooms: only these crates may use them, in their tests too.
-const CONFINED: [(&str, &[&str]); 11] = [
+const CONFINED: [(&str, &[&str]); 14] = [
     ("wasmtime", &["bumpless-engine"]),
     ("zenoh", &["bumpless-cell"]),
     ("sysinfo", &["bumpless-cell"]),
     ("axum", &["bumpless-api"]),
     ("utoipa", &["bumpless-api"]),
     ("prometheus-client", &["bumpless-api"]),
+    ("opentelemetry", &["bumpless-telemetry"]),
+    ("opentelemetry_sdk", &["bumpless-telemetry"]),
+    ("opentelemetry-otlp", &["bumpless-telemetry"]),
     ("tokio-rustls", &["bumpless-io"]),
     ("redb", &["bumpless-store"]),
     ("ratatui", &["bumpless-app"]),

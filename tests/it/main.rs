@@ -18,6 +18,7 @@
 //! | modbus | a real Modbus device that dies and comes back |
 //! | scada | the cell as a Modbus device: points of another host, commands to a loop |
 //! | neighbours | two cells on one machine |
+//! | api | strangers who read the document, the metrics and the traces |
 //! | watching | metrics, the document of the API, the live feed |
 //! | library | trials, labels, bundles, bombs and crowds of components |
 //! | stock | every stock law passes its trial |
@@ -33,6 +34,7 @@
 )]
 
 mod alarms;
+mod api;
 mod calls;
 mod changes;
 mod chaos;

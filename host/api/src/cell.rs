@@ -6,8 +6,8 @@ use std::{future::Future, pin::Pin, sync::Arc};
 
 use bumpless_core::{CommandBody, CommandId, ComponentInfo, Digest, HostId, LoopId, Record};
 use bumpless_deploy::{
-    ApplyEnd, Call, CallEnd, Change, CommandEnd, ComponentView, Counters, Deploy, DrainEnd, DrainOrder, Error,
-    HostView, Imported, LoopDraft, LoopView, PointView, Relabel, StageView, Upload,
+    ApplyEnd, Call, CallEnd, Change, CommandEnd, ComponentView, Counters, Deploy, DrainEnd, DrainOrder, Error, Expect,
+    HealthView, HostView, Imported, LoopDraft, LoopView, PointView, Relabel, StageView, Upload,
 };
 use bumpless_deploy::{
     Window,
@@ -34,14 +34,14 @@ pub(crate) trait Cell: Field {
     fn resolve(&self, reference: &str) -> Result<ComponentInfo, Error>;
     fn component_bytes(&self, digest: Digest) -> Answer<Vec<u8>>;
     fn remove_component(&self, reference: String) -> Answer<()>;
-    fn apply(&self, draft: LoopDraft) -> Answer<ApplyEnd>;
+    fn apply(&self, draft: LoopDraft, expect: Expect) -> Answer<ApplyEnd>;
     fn loops(&self) -> Vec<LoopView>;
     fn loop_view(&self, id: &LoopId) -> Result<LoopView, Error>;
     fn command(&self, id: LoopId, command_id: Option<CommandId>, body: CommandBody) -> Answer<CommandEnd>;
-    fn swap(&self, id: LoopId, component: String) -> Answer<ApplyEnd>;
-    fn set(&self, id: LoopId, change: Change) -> Answer<ApplyEnd>;
-    fn rollback(&self, id: LoopId, revision: Option<u64>) -> Answer<ApplyEnd>;
-    fn delete(&self, id: LoopId) -> Answer<()>;
+    fn swap(&self, id: LoopId, component: String, expect: Expect) -> Answer<ApplyEnd>;
+    fn set(&self, id: LoopId, change: Change, expect: Expect) -> Answer<ApplyEnd>;
+    fn rollback(&self, id: LoopId, revision: Option<u64>, expect: Expect) -> Answer<ApplyEnd>;
+    fn delete(&self, id: LoopId, expect: Expect) -> Answer<()>;
     fn move_owner(&self, id: LoopId, to: HostId) -> Answer<()>;
     fn cycles(&self, id: LoopId, window: Window, max: u32) -> Answer<CyclesView>;
     fn replay(&self, id: LoopId, window: Window) -> Answer<ReplayReport>;
@@ -59,6 +59,7 @@ pub(crate) trait Cell: Field {
     fn act_on_alarm(&self, id: LoopId, alarm: String, act: AlarmAct, by: String) -> Answer<Option<AlarmView>>;
     fn hosts(&self) -> Vec<HostView>;
     fn drain(&self, host: HostId, order: DrainOrder) -> Answer<DrainEnd>;
+    fn health(&self, host: HostId) -> Answer<HealthView>;
     fn here(&self) -> HostId;
     fn points(&self) -> Answer<Vec<PointView>>;
     fn call(&self, call: Call) -> Answer<CallEnd>;
@@ -115,9 +116,9 @@ impl Cell for Deploy {
         Box::pin(async move { deploy.remove_component(&reference).await })
     }
 
-    fn apply(&self, draft: LoopDraft) -> Answer<ApplyEnd> {
+    fn apply(&self, draft: LoopDraft, expect: Expect) -> Answer<ApplyEnd> {
         let deploy = self.clone();
-        Box::pin(async move { deploy.apply(draft).await })
+        Box::pin(async move { deploy.apply_if(draft, expect).await })
     }
 
     fn loops(&self) -> Vec<LoopView> {
@@ -133,24 +134,24 @@ impl Cell for Deploy {
         Box::pin(async move { deploy.command(&id, command_id, body).await })
     }
 
-    fn swap(&self, id: LoopId, component: String) -> Answer<ApplyEnd> {
+    fn swap(&self, id: LoopId, component: String, expect: Expect) -> Answer<ApplyEnd> {
         let deploy = self.clone();
-        Box::pin(async move { deploy.swap(&id, &component).await })
+        Box::pin(async move { deploy.swap_if(&id, &component, expect).await })
     }
 
-    fn set(&self, id: LoopId, change: Change) -> Answer<ApplyEnd> {
+    fn set(&self, id: LoopId, change: Change, expect: Expect) -> Answer<ApplyEnd> {
         let deploy = self.clone();
-        Box::pin(async move { deploy.set(&id, change).await })
+        Box::pin(async move { deploy.set_if(&id, change, expect).await })
     }
 
-    fn rollback(&self, id: LoopId, revision: Option<u64>) -> Answer<ApplyEnd> {
+    fn rollback(&self, id: LoopId, revision: Option<u64>, expect: Expect) -> Answer<ApplyEnd> {
         let deploy = self.clone();
-        Box::pin(async move { deploy.rollback(&id, revision).await })
+        Box::pin(async move { deploy.rollback_if(&id, revision, expect).await })
     }
 
-    fn delete(&self, id: LoopId) -> Answer<()> {
+    fn delete(&self, id: LoopId, expect: Expect) -> Answer<()> {
         let deploy = self.clone();
-        Box::pin(async move { deploy.delete(&id).await })
+        Box::pin(async move { deploy.delete_if(&id, expect).await })
     }
 
     fn move_owner(&self, id: LoopId, to: HostId) -> Answer<()> {
@@ -235,6 +236,11 @@ impl Cell for Deploy {
     fn drain(&self, host: HostId, order: DrainOrder) -> Answer<DrainEnd> {
         let deploy = self.clone();
         Box::pin(async move { deploy.drain(&host, order).await })
+    }
+
+    fn health(&self, host: HostId) -> Answer<HealthView> {
+        let deploy = self.clone();
+        Box::pin(async move { deploy.health(&host).await })
     }
 
     fn here(&self) -> HostId {

@@ -4,7 +4,9 @@
 //! |---|---|---|
 //! | bad request, wrong content type, too large, invalid | 400, 415, 413, 422 | the asker, by asking otherwise |
 //! | no such route, not found, method | 404, 404, 405 | the asker, by asking elsewhere |
-//! | refused | 409 | the asker, once the cell has or does something else |
+//! | refused, in progress | 409 | the asker, once the cell has or does something else |
+//! | precondition | 412 | the asker, who counts on what has changed |
+//! | key reused | 422 | the asker, with a new key |
 //! | busy, unreachable | 503 | time |
 //! | timeout | 504 | time; what was asked may still happen |
 //! | store, internal | 500 | the operator |
@@ -38,6 +40,9 @@ pub(crate) enum Kind {
     NotFound,
     Method,
     Refused,
+    InProgress,
+    Precondition,
+    KeyReused,
     TooLarge,
     ContentType,
     Invalid,
@@ -65,6 +70,17 @@ impl Kind {
                 StatusCode::METHOD_NOT_ALLOWED,
             ),
             Self::Refused => ("refused", "The cell refuses this now", StatusCode::CONFLICT),
+            Self::InProgress => ("in-progress", "This is being worked on already", StatusCode::CONFLICT),
+            Self::Precondition => (
+                "precondition",
+                "It is not what the request counts on",
+                StatusCode::PRECONDITION_FAILED,
+            ),
+            Self::KeyReused => (
+                "key-reused",
+                "The key belongs to another request",
+                StatusCode::UNPROCESSABLE_ENTITY,
+            ),
             Self::TooLarge => ("too-large", "The body is too large", StatusCode::PAYLOAD_TOO_LARGE),
             Self::ContentType => (
                 "content-type",
@@ -122,6 +138,15 @@ impl Problem {
             cure: Some(cure.into()).filter(|cure| !cure.is_empty()),
         }
     }
+
+    /// A body beyond the limit of its address, in bytes.
+    pub(crate) fn too_large(bytes_max: usize) -> Self {
+        Self::new(
+            Kind::TooLarge,
+            format!("the body is longer than {bytes_max} bytes"),
+            "send less: this is the limit of this address",
+        )
+    }
 }
 
 impl From<DeployError> for Problem {
@@ -130,6 +155,7 @@ impl From<DeployError> for Problem {
             DeployError::NotFound(_) => Kind::NotFound,
             DeployError::Invalid(_) => Kind::Invalid,
             DeployError::Refused(_) => Kind::Refused,
+            DeployError::Stale(_) => Kind::Precondition,
             DeployError::Busy(_) => Kind::Busy,
             DeployError::Unreachable(_) => Kind::Unreachable,
             DeployError::Timeout(_) => Kind::Timeout,
@@ -153,7 +179,7 @@ impl IntoResponse for Problem {
         // Five strings and a number always serialise; an empty body is still an honest status.
         let body = serde_json::to_vec(&self).unwrap_or_default();
         let mut response = (status, [(header::CONTENT_TYPE, PROBLEM_JSON)], body).into_response();
-        if status == StatusCode::SERVICE_UNAVAILABLE {
+        if status == StatusCode::SERVICE_UNAVAILABLE || self.kind.ends_with(":in-progress") {
             response
                 .headers_mut()
                 .insert(header::RETRY_AFTER, HeaderValue::from_static("1"));
@@ -171,10 +197,11 @@ mod tests {
     #[test]
     fn every_error_of_the_cell_has_its_status() {
         let words = |reason: &str, cure: &str| bumpless_deploy::Words::new(reason, cure);
-        let table: [(DeployError, u16, &str); 8] = [
+        let table: [(DeployError, u16, &str); 9] = [
             (DeployError::NotFound(words("a", "b")), 404, "not-found"),
             (DeployError::Invalid(words("a", "b")), 422, "invalid"),
             (DeployError::Refused(words("a", "b")), 409, "refused"),
+            (DeployError::Stale(words("a", "b")), 412, "precondition"),
             (DeployError::Busy(words("a", "b")), 503, "busy"),
             (DeployError::Unreachable(words("a", "b")), 503, "unreachable"),
             (DeployError::Timeout(words("a", "b")), 504, "timeout"),

@@ -72,18 +72,23 @@ impl<S: Sync> FromRequestParts<S> for IdempotencyKey {
     type Rejection = Problem;
 
     async fn from_request_parts(parts: &mut Parts, _: &S) -> Result<Self, Problem> {
-        let Some(value) = parts.headers.get("idempotency-key") else {
-            return Ok(Self(None));
-        };
-        let id = value.to_str().ok().and_then(command_id);
-        id.map(|id| Self(Some(id))).ok_or_else(|| {
-            Problem::new(
-                Kind::BadRequest,
-                "the header Idempotency-Key is no key",
-                "use a UUID, or 1 to 32 hexadecimal digits, new for each command",
-            )
-        })
+        idempotency_key(&parts.headers).map(Self)
     }
+}
+
+/// The key of a change, where it has one.
+pub(crate) fn idempotency_key(headers: &HeaderMap) -> Result<Option<CommandId>, Problem> {
+    let Some(value) = headers.get("idempotency-key") else {
+        return Ok(None);
+    };
+    let id = value.to_str().ok().and_then(command_id);
+    id.map(Some).ok_or_else(|| {
+        Problem::new(
+            Kind::BadRequest,
+            "the header Idempotency-Key is no key",
+            "use a UUID, or 1 to 32 hexadecimal digits, new for each change",
+        )
+    })
 }
 
 /// 1 to 32 hexadecimal digits, with or without the quotes and dashes of a UUID.
@@ -125,11 +130,7 @@ pub(crate) async fn body_bytes(body: Body, bytes_max: usize) -> Result<Vec<u8>, 
             )
         })?;
         if bytes.len() + piece.len() > bytes_max {
-            return Err(Problem::new(
-                Kind::TooLarge,
-                format!("the body is longer than {bytes_max} bytes"),
-                "send less: this is the limit of this address",
-            ));
+            return Err(Problem::too_large(bytes_max));
         }
         bytes.extend_from_slice(&piece);
     }

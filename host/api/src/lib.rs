@@ -8,7 +8,9 @@
 //! connection (CONNECTIONS_MAX) ─► request (REQUESTS_MAX) ─► time limit ─► extract ─► Cell (deploy) ─► types ─► JSON
 //!             └ full: waits                  └ full: 503       └ over: 504  └ bad: 4xx  └ error: the map in `error`
 //! ```
-//! A change that has begun is finished even when its asker leaves.
+//! A change that has begun is finished even when its asker leaves (`once`: and done once, however often it is asked for).
+//!
+//! What all routes share is `extract`, `paging`, `tag` and `once`; a new route gets limits, keys and documented errors by itself.
 //!
 //! Reading order: `types`, `routes`, `server`; `error` has the map.
 
@@ -22,17 +24,21 @@ mod field;
 mod gate;
 mod metrics;
 mod notices;
+mod once;
 mod openapi;
+mod paging;
 #[allow(
     unused_qualifications,
     reason = "utoipa writes `super::` before the query types of the routes"
 )]
 mod routes;
 mod server;
+mod tag;
 
 #[cfg(test)]
 mod tests;
 
 pub use error::{Error, Problem};
+pub use metrics::Metrics;
 pub use openapi::openapi_json;
 pub use server::{Options, serve};

@@ -57,14 +57,27 @@ pub const FEED_LOOPS_MAX: usize = 64;
 /// Recorded cycles of one answer, where the asker says nothing.
 pub const CYCLES_DEFAULT: u64 = 100;
 
-/// Loops of one answer of the list, where the asker names no number.
+/// Keys of changes that a host remembers, the newest. A hundred changes a second would be much for people and scripts alike;
+/// then a key is still good for 40 s.
+pub const KEYS_MAX: usize = 4_096;
+
+/// Time for which a key is remembered: longer than anyone asks again after a connection broke.
+pub const KEY_TIME_MAX: Duration = Duration::from_secs(3_600);
+
+/// Longest answer that is remembered with a key; with [`KEYS_MAX`], 64 MiB at worst, and some 4 MiB with answers as they are.
+pub const KEY_ANSWER_BYTES_MAX: usize = 16 * 1024;
+
+/// Rows of one answer of a list, where the asker names no number.
 pub const PAGE_DEFAULT: usize = 1_000;
 
-/// Loops of one answer of the list at most: some 10 MB of JSON.
+/// Rows of one answer of a list at most: some 10 MB of JSON.
 pub const PAGE_MAX: usize = 10_000;
 
 /// Loops that have metrics of their own; the totals count all of them. Prometheus keeps one series per loop and metric.
 pub const METRIC_LOOPS_MAX: usize = 2_000;
+
+/// Loops that have histograms of their own, the first that are seen: some 45 series each.
+pub const METRIC_TIMED_LOOPS_MAX: usize = 200;
 
 /// Hosts that have histograms of their own; the steps of others are counted under `other`.
 pub const METRIC_HOSTS_MAX: usize = 256;

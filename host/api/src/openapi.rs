@@ -1,10 +1,14 @@
 //! The OpenAPI document, made from the routes and types, so that it cannot say anything else than the code.
 
+mod complete;
+
+use std::sync::LazyLock;
+
 use utoipa::OpenApi;
 
 use crate::{
     error::Problem,
-    routes::{alarms, bundle, components, demo, field, history, hosts, live, loops, pages, rollouts, trend},
+    routes::{alarms, bundle, components, demo, field, health, history, hosts, live, loops, pages, rollouts, trend},
     types,
 };
 
@@ -23,11 +27,11 @@ use crate::{
         history::cycles, history::replay, history::backtest,
         history::start_shadow, history::shadows, history::show_shadow, history::stop_shadow,
         rollouts::start, rollouts::list, rollouts::show, rollouts::stop,
-        alarms::list, alarms::past, alarms::act, alarms::define, alarms::remove,
-        hosts::list, hosts::drain, hosts::undrain, hosts::points, live::feed, trend::trend, trend::list_notices, demo::show, demo::fault,
+        alarms::list, alarms::past, alarms::show, alarms::act, alarms::define, alarms::remove,
+        hosts::list, health::of_host, hosts::drain, hosts::undrain, hosts::points, live::feed, trend::trend, trend::list_notices, demo::show, demo::fault,
         field::point, field::write, field::force, field::unforce, field::buses,
         field::start, field::jobs, field::job, field::cancel,
-        pages::healthz, pages::readyz, pages::metrics, pages::openapi,
+        health::livez, health::readyz, pages::metrics, pages::openapi,
     ),
     components(schemas(Problem, types::Record, types::Hosts, types::LiveRows, types::Standing, types::FieldNews)),
     tags(
@@ -46,11 +50,13 @@ struct Document;
 
 /// The document as pretty JSON with a final newline: what `docs/openapi.json` holds.
 #[must_use]
-pub fn openapi_json() -> String {
-    // The document is strings and numbers, so it always serialises; the test below would see an empty one.
-    let mut text = Document::openapi().to_pretty_json().unwrap_or_default();
-    text.push('\n');
-    text
+pub fn openapi_json() -> &'static str {
+    static TEXT: LazyLock<String> = LazyLock::new(|| {
+        // The document is strings and numbers, so it always serialises; the test below would see an empty one.
+        let document = serde_json::to_value(Document::openapi()).unwrap_or_default();
+        format!("{:#}\n", complete::complete(document))
+    });
+    &TEXT
 }
 
 #[cfg(test)]
@@ -64,7 +70,7 @@ mod tests {
         let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/openapi.json");
         let now = openapi_json();
         if std::env::var_os("UPDATE_EXPECT").is_some() {
-            std::fs::write(path, &now).expect("docs/openapi.json can be written");
+            std::fs::write(path, now).expect("docs/openapi.json can be written");
         }
         let kept = std::fs::read_to_string(path).unwrap_or_default();
         assert!(
@@ -75,7 +81,7 @@ mod tests {
 
     #[test]
     fn every_operation_has_a_name_of_its_own() {
-        let document: serde_json::Value = serde_json::from_str(&openapi_json()).expect("it is JSON");
+        let document: serde_json::Value = serde_json::from_str(openapi_json()).expect("it is JSON");
         let paths = document["paths"].as_object().expect("paths");
         let ids: Vec<&str> = paths
             .values()
@@ -92,10 +98,104 @@ mod tests {
 
     #[test]
     fn every_route_is_in_the_document() {
-        let document: serde_json::Value = serde_json::from_str(&openapi_json()).expect("it is JSON");
+        let document: serde_json::Value = serde_json::from_str(openapi_json()).expect("it is JSON");
         let listed = document["paths"].as_object().expect("paths").len();
         let routes = include_str!("routes.rs").matches(".route(").count();
-        // The page for people at "/" is no part of the API.
-        assert_eq!(listed, routes - 1);
+        // The page for people at "/", and the older name of /livez, are no part of the API.
+        assert_eq!(listed, routes - 2);
+    }
+
+    /// Every operation of the document: method, path, and what is said of it.
+    fn operations() -> Vec<(String, String, serde_json::Value)> {
+        let document: serde_json::Value = serde_json::from_str(openapi_json()).expect("it is JSON");
+        let paths = document["paths"].as_object().expect("paths").clone();
+        let of = |(path, methods): (String, serde_json::Value)| {
+            let methods = methods.as_object().expect("operations").clone();
+            methods
+                .into_iter()
+                .map(move |(method, operation)| (method, path.clone(), operation))
+        };
+        paths.into_iter().flat_map(of).collect()
+    }
+
+    #[test]
+    fn every_operation_names_every_answer_that_it_may_give() {
+        for (method, path, operation) in operations() {
+            let answers: Vec<&String> = operation["responses"].as_object().expect("answers").keys().collect();
+            let place = format!("{method} {path}: {answers:?}");
+            let has = |status: &str| answers.iter().any(|one| *one == status);
+            assert!(!has("default"), "{place}");
+            assert!(has("500"), "{place}");
+            if method != "get" {
+                let keyed = operation["parameters"].to_string().contains("Idempotency-Key");
+                assert!(keyed && has("409") && has("422"), "{place}");
+            }
+            if path.contains('{') {
+                assert!(has("404") && has("400"), "{place}");
+            }
+            if operation["requestBody"].is_object() {
+                assert!(has("413") && has("415"), "{place}");
+            }
+        }
+    }
+
+    /// The shape of an answer: its keys, and of a list the shape of its first row.
+    fn shape(value: &serde_json::Value) -> serde_json::Value {
+        use serde_json::Value;
+        match value {
+            Value::Object(map) => map.iter().map(|(key, value)| (key.clone(), shape(value))).collect(),
+            Value::Array(rows) => rows.first().map(shape).into_iter().collect(),
+            _ => Value::Null,
+        }
+    }
+
+    #[tokio::test]
+    async fn every_operation_has_an_example_that_the_api_gives() {
+        use crate::tests::example_answer;
+        let path = concat!(env!("CARGO_MANIFEST_DIR"), "/src/openapi/examples.json");
+        let update = std::env::var_os("UPDATE_EXPECT").is_some();
+        let mut examples = complete::ALL_EXAMPLES.clone();
+        let mut wrong = Vec::new();
+        let hint = "write `path` and `request` into host/api/src/openapi/examples.json, then `cargo xtask openapi` asks for the answer";
+        for (method, template, operation) in operations() {
+            let id = operation["operationId"].as_str().expect("an id").to_owned();
+            let good = operation["responses"].as_object().expect("answers").iter();
+            let plain = |content: &serde_json::Value| content.get("application/json").is_some();
+            let json_answer = good
+                .clone()
+                .any(|(status, answer)| status.starts_with('2') && plain(&answer["content"]));
+            let no_body = good
+                .clone()
+                .any(|(status, answer)| status.starts_with('2') && answer.get("content").is_none());
+            let binary_request = operation["requestBody"].is_object() && !plain(&operation["requestBody"]["content"]);
+            let Some(example) = examples.get_mut(&id) else {
+                // Bytes have no example in a text.
+                if (json_answer || no_body) && !binary_request {
+                    wrong.push(format!("{method} {template}: no example; {hint}"));
+                }
+                continue;
+            };
+            if !json_answer && !no_body || id == "read_openapi" {
+                continue;
+            }
+            let asked = example["path"].as_str().unwrap_or_default().to_owned();
+            let (status, answer) = example_answer(&method, &asked, example.get("request")).await;
+            if !(200..300).contains(&status) {
+                wrong.push(format!("{method} {asked}: {status} {answer}"));
+            } else if update {
+                example["status"] = status.into();
+                if !answer.is_null() {
+                    example["answer"] = answer;
+                }
+            } else if example["status"] != status || shape(&example["answer"]) != shape(&answer) {
+                wrong.push(format!("{method} {asked}: another answer than the example's; {hint}"));
+            }
+        }
+        if update {
+            let rows: std::collections::BTreeMap<_, _> = examples.into_iter().collect();
+            let text = serde_json::to_string_pretty(&rows).expect("plain data");
+            std::fs::write(path, format!("{text}\n")).expect("the examples can be written");
+        }
+        assert!(wrong.is_empty(), "{}", wrong.join("\n"));
     }
 }

@@ -7,6 +7,7 @@ pub(crate) mod bundle;
 pub(crate) mod components;
 pub(crate) mod demo;
 pub(crate) mod field;
+pub(crate) mod health;
 pub(crate) mod history;
 pub(crate) mod hosts;
 pub(crate) mod live;
@@ -66,9 +67,13 @@ pub(crate) fn all() -> Router<App> {
         .route("/v1/alarms/history", get(alarms::past))
         .route(
             "/v1/loops/{name}/alarms/{alarm}",
-            post(alarms::act).put(alarms::define).delete(alarms::remove),
+            get(alarms::show)
+                .post(alarms::act)
+                .put(alarms::define)
+                .delete(alarms::remove),
         )
         .route("/v1/hosts", get(hosts::list))
+        .route("/v1/hosts/{name}/health", get(health::of_host))
         .route("/v1/hosts/{name}/drain", post(hosts::drain))
         .route("/v1/hosts/{name}/undrain", post(hosts::undrain))
         .route("/v1/points", get(hosts::points))
@@ -94,6 +99,7 @@ pub(crate) fn all() -> Router<App> {
 /// Is the host alive, is it ready?
 pub(crate) fn health() -> Router<App> {
     Router::new()
-        .route("/healthz", get(pages::healthz))
-        .route("/readyz", get(pages::readyz))
+        .route("/livez", get(health::livez))
+        .route("/healthz", get(health::livez))
+        .route("/readyz", get(health::readyz))
 }

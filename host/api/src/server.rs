@@ -20,12 +20,13 @@ use axum::{
     response::{IntoResponse as _, Response},
 };
 use bumpless_core::Digest;
-use bumpless_deploy::Deploy;
+use bumpless_deploy::{Deploy, SPANS};
 use futures_util::FutureExt as _;
 use tokio::{
     net::TcpListener,
     sync::{Semaphore, mpsc, watch},
 };
+use tracing::Instrument as _;
 
 use crate::{
     cell::{Answer, Cell},
@@ -37,7 +38,8 @@ use crate::{
     },
     metrics::Metrics,
     notices::Notices,
-    routes,
+    once::{Keys, once},
+    paging, routes,
     types::{Fault, PortTable, PortTables},
 };
 
@@ -51,6 +53,8 @@ pub struct Options {
     pub feeds_max: usize,
     /// Who does the faults that are asked for; none in service, only the demonstration has one. A full queue refuses.
     pub faults: Option<mpsc::Sender<Fault>>,
+    /// What the host measures, where somebody else reads it too; else the server makes its own.
+    pub metrics: Option<Arc<Metrics>>,
 }
 
 impl Default for Options {
@@ -59,6 +63,7 @@ impl Default for Options {
             requests_max: REQUESTS_MAX,
             feeds_max: FEEDS_MAX,
             faults: None,
+            metrics: None,
         }
     }
 }
@@ -81,6 +86,10 @@ pub(crate) struct App {
     pub(crate) notices: Arc<Notices>,
     /// Where all loops stand, as JSON, and since when that is known.
     pub(crate) standing: Arc<Mutex<Option<Standing>>>,
+    /// What was asked for and done, by key.
+    pub(crate) keys: Arc<Keys>,
+    /// Held from the look at a tag to the change that relies on it; changes without a condition pass by.
+    pub(crate) conditional: Arc<tokio::sync::Mutex<()>>,
     /// Who does the faults of the demonstration.
     pub(crate) faults: Option<mpsc::Sender<Fault>>,
     requests: Arc<Semaphore>,
@@ -90,13 +99,18 @@ pub(crate) struct App {
 impl App {
     pub(crate) fn new(cell: Arc<dyn Cell>, options: &Options, stop: watch::Receiver<bool>) -> Self {
         Self {
-            metrics: Arc::new(Metrics::new(Arc::clone(&cell))),
+            metrics: options
+                .metrics
+                .clone()
+                .unwrap_or_else(|| Arc::new(Metrics::new(Arc::clone(&cell)))),
             feeds: Arc::new(Semaphore::new(options.feeds_max)),
             uploads: Arc::new(Semaphore::new(UPLOADS_MAX)),
             requests: Arc::new(Semaphore::new(options.requests_max)),
             ports: Arc::default(),
             notices: Arc::new(Notices::new()),
             standing: Arc::default(),
+            keys: Arc::default(),
+            conditional: Arc::default(),
             faults: options.faults.clone(),
             stop,
             cell,
@@ -124,7 +138,7 @@ impl App {
 
 /// Finishes what was begun, even when its asker leaves: a change stops only at an end that the cell knows.
 pub(crate) async fn finish<T: Send + 'static>(answer: Answer<T>) -> Result<T, Problem> {
-    match tokio::spawn(answer).await {
+    match tokio::spawn(answer.in_current_span()).await {
         Ok(result) => result.map_err(Into::into),
         Err(error) => {
             tracing::error!(%error, "a change ended with a panic");
@@ -204,6 +218,7 @@ pub(crate) fn router(app: App) -> Router {
                 "GET / lists them",
             )
         })
+        .layer(middleware::from_fn_with_state(app.clone(), once))
         .layer(middleware::from_fn_with_state(app.clone(), limit));
     // Health is asked for most when the host has no place left.
     limited
@@ -244,28 +259,43 @@ async fn limit(State(app): State<App>, request: Request, next: Next) -> Response
         Err(_) => Problem::new(
             Kind::Timeout,
             format!("the answer took longer than {} s", time.as_secs()),
-            "what was asked may still happen: look before asking again, and use an Idempotency-Key for commands",
+            "what was asked may still happen: ask again with the same Idempotency-Key, or look before asking again",
         )
         .into_response(),
     }
 }
 
-/// Turns a panic into an answer, counts, and adds the headers that every answer has.
+/// Turns a panic into an answer, counts and traces, and adds the headers that every answer has.
 async fn finish_answer(State(app): State<App>, request: Request, next: Next) -> Response {
-    let method = request.method().clone();
-    let mut response = AssertUnwindSafe(next.run(request))
+    let began = Instant::now();
+    let (method, asked) = (known(request.method()), request.uri().clone());
+    // What is no route has no pattern: a client may invent addresses.
+    let matched = request.extensions().get::<MatchedPath>().cloned();
+    let route = matched.as_ref().map_or("none", MatchedPath::as_str);
+    let span = if WATCHED.contains(&route) {
+        tracing::Span::none()
+    } else {
+        tracing::info_span!(
+            target: SPANS, "request", otel.name = format!("{method} {route}"), otel.kind = "server",
+            http.request.method = method, http.route = route, http.response.status_code = tracing::field::Empty,
+        )
+    };
+    let work = AssertUnwindSafe(next.run(request))
         .catch_unwind()
-        .await
-        .unwrap_or_else(|_| {
-            tracing::error!(%method, "a request ended with a panic");
-            Problem::new(
-                Kind::Internal,
-                "the request failed inside the host",
-                "its log says more; report this",
-            )
-            .into_response()
-        });
-    app.metrics.answered(known(&method), response.status().as_u16());
+        .instrument(span.clone());
+    let mut response = work.await.unwrap_or_else(|_| {
+        tracing::error!(method, "a request ended with a panic");
+        Problem::new(
+            Kind::Internal,
+            "the request failed inside the host",
+            "its log says more; report this",
+        )
+        .into_response()
+    });
+    let status = response.status().as_u16();
+    span.record("http.response.status_code", status);
+    app.metrics.answered(method, route, status, began.elapsed());
+    paging::link(&mut response, &asked);
     let headers = response.headers_mut();
     headers.insert(header::X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff"));
     headers
@@ -273,6 +303,9 @@ async fn finish_answer(State(app): State<App>, request: Request, next: Next) -> 
         .or_insert(HeaderValue::from_static("no-store"));
     response
 }
+
+/// Routes that monitoring asks for every few seconds: their spans would only hide the others.
+const WATCHED: [&str; 4] = ["/livez", "/healthz", "/readyz", "/metrics"];
 
 /// The method as a label: a closed list, for a client may invent methods.
 fn known(method: &Method) -> &'static str {

@@ -10,8 +10,10 @@ mod field;
 mod history;
 mod hosts;
 mod library;
+mod metrics;
 mod page;
 mod rollouts;
+mod sharing;
 
 use std::sync::{Arc, atomic::Ordering};
 
@@ -69,6 +71,22 @@ impl Bench {
             .expect("a body");
         (status, serde_json::from_slice(&bytes).unwrap_or(Value::Null))
     }
+}
+
+/// What the API answers to an example of the document: status and JSON.
+pub(crate) async fn example_answer(method: &str, path: &str, request: Option<&Value>) -> (u16, Value) {
+    let (faults, _asked) = tokio::sync::mpsc::channel(1);
+    let bench = Bench::with(&Options {
+        faults: Some(faults),
+        ..Options::default()
+    });
+    let method = method.to_uppercase();
+    let request = match request {
+        Some(body) => send(&method, path, body),
+        None => raw(&method, path, "application/json", ""),
+    };
+    let (status, answer) = bench.json(request).await;
+    (status.as_u16(), answer)
 }
 
 fn get(path: &str) -> Request<Body> {
@@ -506,46 +524,6 @@ async fn a_panic_is_an_answer() {
     );
     bench.cell.panics.store(false, Ordering::Relaxed);
     assert_eq!(bench.json(get("/v1/hosts")).await.0, StatusCode::OK);
-}
-
-#[tokio::test]
-async fn metrics_are_open_metrics_with_units_and_labels() {
-    let bench = Bench::new();
-    bench.json(get("/v1/hosts")).await;
-    let response = bench.ask(get("/metrics")).await;
-    let body = axum::body::to_bytes(response.into_body(), usize::MAX).await.unwrap();
-    let text = String::from_utf8(body.to_vec()).unwrap();
-    for line in [
-        "bumpless_cycles_taken_total 7\n",
-        "bumpless_hosts_alive 1\n",
-        "bumpless_host_alive{host=\"h\"} 1.0\n",
-        "bumpless_loop_cycles_taken_total{loop=\"l\"} 5\n",
-        "bumpless_loop_setpoint{loop=\"l\"} 1.5\n",
-        "bumpless_http_requests_total{method=\"GET\",status=\"200\"} 1\n",
-        "# UNIT bumpless_cycle_seconds seconds\n",
-    ] {
-        assert!(text.contains(line), "{line} is missing in\n{text}");
-    }
-    assert!(text.ends_with("# EOF\n"));
-}
-
-#[tokio::test]
-async fn times_are_observed_from_the_cycles_that_this_host_owned() {
-    let cell = Arc::new(Fake::new());
-    let (stop, stopped) = watch::channel(false);
-    let metrics = Arc::new(crate::metrics::Metrics::new(Arc::clone(&cell) as _));
-    let follower = tokio::spawn(Arc::clone(&metrics).follow(Arc::clone(&cell) as _, stopped));
-    while cell.readers() == 0 {
-        tokio::task::yield_now().await;
-    }
-    cell.publish("l", 1);
-    cell.publish("l", 2);
-    let line = "bumpless_step_seconds_count{host=\"h\"} 2\n";
-    while !metrics.text().unwrap().contains(line) {
-        tokio::task::yield_now().await;
-    }
-    stop.send(true).unwrap();
-    follower.await.expect("the follower ends with the host");
 }
 
 #[tokio::test]

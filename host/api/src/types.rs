@@ -33,7 +33,7 @@ pub use history::{
     BacktestRequest, CurvePoint, CycleFinding, Cycles, LoopIndices, OutputTrial, Replay, ReplayRequest, Shadow,
     ShadowRequest, Shadows, Skipped, StepTimes, Trial, TrialVerdict,
 };
-pub use hosts::{Drain, DrainRequest, Host, Hosts, Point, Points};
+pub use hosts::{Alive, Drain, DrainRequest, Health, HealthCheck, Host, Hosts, Point, Points};
 pub use library::{Admission, AdmissionFinding, ComponentEvent, ComponentHost, Import, Imports, RelabelRequest};
 pub use live::{LiveRow, LiveRows, Notice, Notices, Standing, Trend, Weight};
 pub use loops::{

@@ -40,6 +40,14 @@ pub struct Cli {
     pub(crate) to: To,
 }
 
+impl Cli {
+    /// Shall answers, and errors too, be JSON?
+    #[must_use]
+    pub const fn wants_json(&self) -> bool {
+        self.to.json
+    }
+}
+
 /// Where a command goes, and how its answer is printed.
 #[derive(Debug, Clone, clap::Args)]
 pub(crate) struct To {

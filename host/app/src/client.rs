@@ -21,6 +21,8 @@ const ANSWER_TIME_MAX: Duration = Duration::from_secs(160);
 const WORK_TIME_MAX: Duration = Duration::from_secs(920);
 /// Longest time for the rest of an answer.
 const BODY_TIME_MAX: Duration = Duration::from_secs(120);
+/// Parts of a list at most: with the API's default, a million rows.
+const PARTS_MAX: u32 = 1_000;
 /// Bytes of an answer: the longest list of loops has some tens of MB.
 const ANSWER_BYTES_MAX: u64 = 64 * 1024 * 1024;
 
@@ -128,6 +130,31 @@ impl Client {
     pub(crate) fn get(&self, path: &str) -> Result<Answer, Error> {
         let request = self.agent.get(format!("{}{path}", self.base));
         self.answer(request.config().timeout_recv_body(Some(BODY_TIME_MAX)).build().call())
+    }
+
+    /// `GET` of a list in all its parts, as one answer. `rows` is the key of its rows.
+    pub(crate) fn list(&self, path: &str, rows: &str) -> Result<Answer, Error> {
+        let mut answer = self.get(path)?;
+        let mut all: serde_json::Value = answer.decode()?;
+        let mut parts = 1;
+        while let Some(next) = all.get("next").and_then(serde_json::Value::as_str) {
+            if parts == PARTS_MAX {
+                return Err(Error::Answer {
+                    api: self.base.clone(),
+                    reason: format!("a list in more than {PARTS_MAX} parts"),
+                });
+            }
+            parts += 1;
+            let sign = if path.contains('?') { '&' } else { '?' };
+            let mut part: serde_json::Value = self.get(&format!("{path}{sign}after={}", encoded(next)))?.decode()?;
+            let (following, next) = (part[rows].take(), part["next"].take());
+            if let (Some(all), serde_json::Value::Array(following)) = (all[rows].as_array_mut(), following) {
+                all.extend(following);
+            }
+            all["next"] = next;
+            answer.text = all.to_string();
+        }
+        Ok(answer)
     }
 
     /// `GET` of raw bytes, at most `bytes_max`.

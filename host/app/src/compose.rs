@@ -41,6 +41,8 @@ pub struct Running {
     pub api: SocketAddr,
     /// Where other hosts reach this one.
     pub locators: Vec<String>,
+    /// What the host measures.
+    pub metrics: Arc<bumpless_api::Metrics>,
     deploy: Deploy,
     loops: Loops,
     io: Option<Arc<IoServer>>,
@@ -217,11 +219,14 @@ pub async fn run(config: Config, faults: Option<mpsc::Sender<Fault>>) -> Result<
     };
     let mut options = bumpless_api::Options::default();
     options.faults = faults;
+    let metrics = bumpless_api::Metrics::of(&deploy);
+    options.metrics = Some(Arc::clone(&metrics));
     let serving = bumpless_api::serve(listener, deploy.clone(), options, stopped);
     let api_task = tokio::spawn(serving);
     Ok(Running {
         api,
         locators,
+        metrics,
         deploy,
         loops,
         io,

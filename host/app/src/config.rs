@@ -18,6 +18,13 @@
 //! enabled = true
 //! bytes_max_mib = 512              # then the oldest cycles go
 //!
+//! [otlp]                           # metrics and traces for a collector; nothing is sent without this table
+//! endpoint = "http://127.0.0.1:4318"
+//! metrics = true
+//! traces = true
+//! every_s = 15                     # between two sendings of metrics
+//! headers = {}                     # such as a collector's key
+//!
 //! [testing]                        # a test device; only in a cell whose name begins with "test"
 //! flip_bits_every = 100            # every so-manieth step of this host comes out with a bit turned over
 //!
@@ -86,6 +93,8 @@ pub struct Config {
     pub loops: bumpless_loops::Config,
     /// Bytes on disk for recorded cycles; none to record none.
     pub history_bytes_max: Option<u64>,
+    /// Where metrics and traces are sent; none to send none.
+    pub otlp: Option<bumpless_telemetry::Config>,
     /// Points and loops of the cell as Modbus registers.
     pub modbus_servers: Vec<ModbusServerConfig>,
 }
@@ -117,6 +126,8 @@ pub(crate) struct File {
     loops: LoopsTable,
     #[serde(default)]
     history: HistoryTable,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    otlp: Option<bumpless_telemetry::Config>,
     #[serde(default, skip_serializing_if = "TestingTable::is_empty")]
     testing: TestingTable,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
@@ -280,6 +291,9 @@ impl File {
         cell.check().map_err(|error| wrong("cell", error.to_string()))?;
 
         itself::check(&self.labels, self.clock_offset_s, &wrong)?;
+        if let Some(otlp) = &self.otlp {
+            otlp.check().map_err(|reason| wrong("otlp", reason))?;
+        }
         let mut ids = std::collections::HashSet::new();
         if let Some(twice) = self.bus.iter().find(|bus| !ids.insert(bus.id())) {
             return Err(wrong(
@@ -337,6 +351,7 @@ impl File {
             engine: self.engine.checked(&wrong)?,
             loops,
             history_bytes_max: self.history.checked(&wrong)?,
+            otlp: self.otlp,
             modbus_servers,
         })
     }

@@ -141,6 +141,17 @@ impl Error {
         }
         text
     }
+
+    /// The same for programs, as one line of JSON: the API's problem as it came, of anything else its words.
+    #[must_use]
+    pub fn json(&self) -> String {
+        let text = match self {
+            Self::Problem(problem) => serde_json::to_string(problem),
+            other => serde_json::to_string(&serde_json::json!({ "error": other.report() })),
+        };
+        // Plain text always serialises.
+        text.unwrap_or_default()
+    }
 }
 
 #[cfg(test)]
@@ -172,6 +183,16 @@ mod tests {
         ] {
             assert_eq!(error.exit_code(), code, "{error}");
         }
+    }
+
+    #[test]
+    fn programs_get_the_problem_as_it_came() {
+        let text = problem(409).json();
+        assert!(
+            text.contains("\"type\":\"urn:x\"") && text.contains("\"cure\":\"wait\""),
+            "{text}"
+        );
+        assert_eq!(Error::Usage("x".into()).json(), r#"{"error":"error: x"}"#);
     }
 
     #[test]

@@ -6,29 +6,18 @@
 //! ```
 //! Never: builds a room (that is `compose`).
 
-use std::{
-    io::{IsTerminal as _, Read as _},
-    time::Duration,
-};
+use std::{io::Read as _, sync::Arc, time::Duration};
 
 use bumpless_api::types::Fault;
+use bumpless_telemetry::{Identity, Telemetry};
 use serde::{Deserialize, Serialize};
 use tokio::{
     signal::unix::{SignalKind, signal},
     sync::mpsc,
 };
-use tracing_subscriber::EnvFilter;
 
-use crate::{
-    cli::{HostArgs, LogFormat},
-    compose,
-    config::Config,
-    error::Error,
-    realtime, show,
-};
+use crate::{cli::HostArgs, compose, config::Config, error::Error, log, realtime, show};
 
-/// Log lines where BUMPLESS_LOG says nothing: ours from info up, the bus's only when something is wrong.
-const LOG_DEFAULT: &str = "info,zenoh=warn,zenoh_transport=error,zenoh_link_commons=error";
 /// Tasks of the runtime get this long to end once everything is stopped.
 const RUNTIME_STOP_TIME_MAX: Duration = Duration::from_secs(2);
 
@@ -66,40 +55,41 @@ pub(crate) fn run(args: &HostArgs) -> Result<(), Error> {
             config.api_listen
         ));
     }
-    log(args.log_format);
+    let identity = Identity {
+        host: config.host.to_string(),
+        cell: config.cell.cell.to_string(),
+        version: env!("CARGO_PKG_VERSION").to_owned(),
+    };
+    let telemetry = config.otlp.clone().map(|otlp| Telemetry::start(otlp, identity));
+    let telemetry = telemetry
+        .transpose()
+        .map_err(|error| Error::start("telemetry", error))?;
+    log::start(args.log_format, telemetry.as_ref());
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
         .thread_name("async")
         .build()
         .map_err(|error| Error::start("the async runtime", error))?;
-    let end = runtime.block_on(live(config, args.until_stdin_closes, args.faults_on_stdout));
+    let end = runtime.block_on(live(config, telemetry, args));
     runtime.shutdown_timeout(RUNTIME_STOP_TIME_MAX);
     end
 }
 
-/// Log lines go to the error output; the standard output is for the line that says "ready".
-fn log(format: LogFormat) {
-    let filter = EnvFilter::try_from_env("BUMPLESS_LOG").unwrap_or_else(|_| EnvFilter::new(LOG_DEFAULT));
-    let lines = tracing_subscriber::fmt()
-        .with_env_filter(filter)
-        .with_writer(std::io::stderr)
-        .with_ansi(std::io::stderr().is_terminal());
-    // Only one log can be set; whoever set one before (a test) keeps it.
-    let _ = match format {
-        LogFormat::Text => lines.try_init(),
-        LogFormat::Json => lines.json().try_init(),
-    };
-}
-
-async fn live(config: Config, until_stdin_closes: bool, faults_on_stdout: bool) -> Result<(), Error> {
+async fn live(config: Config, mut telemetry: Option<Telemetry>, args: &HostArgs) -> Result<(), Error> {
     // Before anything is started, so that no signal is missed.
     let mut terminate = signal(SignalKind::terminate()).map_err(|error| Error::start("the signal handler", error))?;
     let mut interrupt = signal(SignalKind::interrupt()).map_err(|error| Error::start("the signal handler", error))?;
-    let parent_gone = parent_gone(until_stdin_closes)?;
+    let parent_gone = parent_gone(args.until_stdin_closes)?;
 
     let (host, wish) = (config.host.clone(), config.realtime);
-    let mut running = compose::run(config, faults_on_stdout.then(pass_faults_on)).await?;
+    let mut running = compose::run(config, args.faults_on_stdout.then(pass_faults_on)).await?;
     realtime::raise(wish)?;
+    if let Some(telemetry) = &mut telemetry {
+        let metrics = Arc::clone(&running.metrics);
+        telemetry
+            .send_metrics(Arc::new(move || metrics.text().ok()))
+            .map_err(|error| Error::start("telemetry", error))?;
+    }
     let ready = Ready {
         ready: true,
         host: host.to_string(),
@@ -115,6 +105,13 @@ async fn live(config: Config, until_stdin_closes: bool, faults_on_stdout: bool) 
         error = running.failed() => Err(error),
     };
     running.stop().await;
+    if let Some(telemetry) = telemetry {
+        // It waits for the collector, for some seconds at most.
+        let ended = tokio::task::spawn_blocking(move || telemetry.stop()).await;
+        if let Err(error) = ended {
+            tracing::warn!(%error, "telemetry ended with a panic");
+        }
+    }
     tracing::info!("stopped");
     end
 }

@@ -17,6 +17,7 @@ mod commands;
 mod demo;
 mod error;
 mod host;
+mod log;
 mod show;
 mod stop;
 mod watch;

@@ -6,10 +6,12 @@ use clap::Parser as _;
 
 #[allow(clippy::print_stderr, reason = "a command-line tool speaks to its terminal")]
 fn main() -> ExitCode {
-    match bumpless_app::run(bumpless_app::Cli::parse()) {
+    let cli = bumpless_app::Cli::parse();
+    let json = cli.wants_json();
+    match bumpless_app::run(cli) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("{}", error.report());
+            eprintln!("{}", if json { error.json() } else { error.report() });
             ExitCode::from(error.exit_code())
         }
     }

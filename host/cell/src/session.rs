@@ -148,6 +148,12 @@ impl Session {
         hosts
     }
 
+    /// Is the bus open? It is until [`Session::close`], or until Zenoh gives up.
+    #[must_use]
+    pub fn is_open(&self) -> bool {
+        self.shared.zenoh().is_ok_and(|zenoh| !zenoh.is_closed())
+    }
+
     /// What was sent, received and lost so far.
     #[must_use]
     pub fn counters(&self) -> Counters {

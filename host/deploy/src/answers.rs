@@ -23,11 +23,12 @@ impl Room {
     pub(crate) fn answer(self: Arc<Self>, from: HostId, ask: Ask) -> Answer {
         Box::pin(async move {
             match ask {
-                Ask::Apply(draft) => self.apply_here(from, *draft).await.map(Told::Applied),
-                Ask::Amend(id, amend) => self.amend_here(from, id, amend).await.map(Told::Applied),
+                Ask::Apply(draft, expect) => self.apply_here(from, *draft, expect).await.map(Told::Applied),
+                Ask::Amend(id, amend, expect) => self.amend_here(from, id, amend, expect).await.map(Told::Applied),
                 Ask::Command(id, command) => self.command_here(&id, command).await.map(Told::Commanded),
-                Ask::Delete(id) => self.delete_here(id).await.map(|()| Told::Done),
+                Ask::Delete(id, expect) => self.delete_here(id, expect).await.map(|()| Told::Done),
                 Ask::Drain(order) => self.drain_here(order).await.map(Told::Drained),
+                Ask::Health => Ok(Told::Health(self.health_here().await)),
                 Ask::Move(id, to) => self.move_here(&id, &to).map(|()| Told::Done),
                 Ask::Try(spec) => self.try_here(&from, *spec).await,
                 Ask::Hold(intent, revision) => self.hold_here(&from, *intent, revision).await,

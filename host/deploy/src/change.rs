@@ -20,13 +20,16 @@ use bumpless_core::{
 use bumpless_loops::CommandReply;
 use futures_util::future::join_all;
 use tokio::{sync::oneshot, time::timeout};
+use tracing::{Instrument as _, info_span};
 
 use crate::{
+    SPANS,
     admission::step_warnings,
     bench::stopping,
     change::readiness::Readiness,
     draft::LoopDraft,
     error::{Error, chain},
+    expect::Expect,
     holder::wanted_members,
     limits::{CHANGE_WAIT, COMMAND_WAIT_MIN, LOOPS_MAX, READY_WAIT},
     plan::{self, Ground},
@@ -70,9 +73,15 @@ enum Revised {
 
 impl Room {
     /// Creates or changes a loop whose points are here.
-    pub(crate) async fn apply_here(self: &Arc<Self>, from: HostId, draft: LoopDraft) -> Result<ApplyEnd, Error> {
+    pub(crate) async fn apply_here(
+        self: &Arc<Self>,
+        from: HostId,
+        draft: LoopDraft,
+        expect: Expect,
+    ) -> Result<ApplyEnd, Error> {
         let id = plan::loop_id(&draft.name)?;
         self.in_turn(id.clone(), move |room| async move {
+            room.expected(&id, &expect).await?;
             let info = room.component(&draft.component, &from).await?;
             let fallback = match &draft.fallback {
                 Some(reference) => Some(room.component(reference, &from).await?),
@@ -96,6 +105,18 @@ impl Room {
         .await
     }
 
+    /// Does what a change relies on hold? The caller has the loop's turn.
+    async fn expected(self: &Arc<Self>, id: &LoopId, expect: &Expect) -> Result<(), Error> {
+        if *expect == Expect::Anything {
+            return Ok(());
+        }
+        // A revision whose record is there, but not yet in the book, counts.
+        if self.book.get(id).is_some() {
+            self.settle_locked(id).await?;
+        }
+        expect.check(id, self.book.get(id).map(|intent| intent.current.revision))
+    }
+
     fn is_home(&self, intent: &Intent) -> Result<(), Error> {
         if intent.home == self.here {
             return Ok(());
@@ -117,7 +138,10 @@ impl Room {
     {
         let room = Arc::clone(self);
         let (sender, receiver) = oneshot::channel();
-        self.spawn(async move {
+        let span =
+            info_span!(target: SPANS, "change", loop.name = %id, host = %self.here, good = tracing::field::Empty);
+        let whole = span.clone();
+        let task = async move {
             let end = async {
                 let crowded = |_| {
                     Error::busy(
@@ -145,10 +169,12 @@ impl Room {
             } else {
                 &room.tallies.applies_refused
             });
+            whole.record("good", end.is_ok());
             room.poke();
             // The asker may have gone.
             let _ = sender.send(end);
-        });
+        };
+        self.spawn(task.instrument(span));
         receiver.await.map_err(|_| stopping())?
     }
 
@@ -263,7 +289,8 @@ impl Room {
         if members.is_empty() {
             return Err(nobody());
         }
-        let tried = self.ask_members(&members, &Ask::Try(Box::new(spec.clone()))).await;
+        let tried = self.ask_members(&members, &Ask::Try(Box::new(spec.clone())));
+        let tried = tried.instrument(info_span!(target: SPANS, "try")).await;
         if tried.ready.is_empty() {
             return Err(tried.failure(&format!("no host can run loop {id}"), "nothing was created"));
         }
@@ -281,6 +308,7 @@ impl Room {
         // Those that are ready before the first cycle need not decline it; the others follow by themselves.
         let held = self
             .ask_members(&tried.ready, &Ask::Hold(Box::new((*intent).clone()), revision))
+            .instrument(info_span!(target: SPANS, "make ready", revision))
             .await;
         for host in held.ready {
             self.homes.told(&host, vec![(id.clone(), revision)], &[], false);
@@ -408,6 +436,7 @@ impl Room {
         }
         let readiness = self
             .ask_members(&members, &Ask::Hold(Box::new(intent.clone()), revision))
+            .instrument(info_span!(target: SPANS, "make ready", revision))
             .await;
         for host in &readiness.ready {
             self.homes.told(host, vec![(id.clone(), revision)], &[], false);
@@ -423,7 +452,8 @@ impl Room {
                 "the old revision stays in force",
             ));
         }
-        self.revise(id, revision, intent.current.period_ns).await
+        let switch = self.revise(id, revision, intent.current.period_ns);
+        switch.instrument(info_span!(target: SPANS, "switch", revision)).await
     }
 
     /// Asks the loop to go on with a revision, and waits until that is decided one way or the other.
@@ -510,7 +540,8 @@ impl Room {
         if home != self.here {
             self.book.keep(Arc::new(intent)).await?;
         }
-        self.hold(&spec, &home).await.map(|()| Told::Done)
+        let span = info_span!(target: SPANS, "hold", loop.name = %spec.id, revision, host = %self.here);
+        self.hold(&spec, &home).instrument(span).await.map(|()| Told::Done)
     }
 }
 

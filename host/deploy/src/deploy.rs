@@ -16,6 +16,8 @@ use crate::{
     book::on_disk,
     draft::{Change, LoopDraft},
     error::Error,
+    expect::Expect,
+    health::HealthView,
     library::title,
     limits::{ANSWER_MARGIN, ANSWER_WAIT, APPLY_WAIT, DRAIN_ORDER_WAIT, DRAIN_SETTLE, DRAIN_WAIT},
     orders::command_wait,
@@ -190,7 +192,15 @@ impl Deploy {
     /// [`Error::Invalid`], [`Error::NotFound`] for a component or point, [`Error::Refused`] by a host or by the running
     /// loop (for example because of the bump), [`Error::Busy`], [`Error::Unreachable`]. Then nothing has changed.
     /// [`Error::Timeout`] after 28 s without an answer: look at the loop.
-    pub async fn apply(&self, mut draft: LoopDraft) -> Result<ApplyEnd, Error> {
+    pub async fn apply(&self, draft: LoopDraft) -> Result<ApplyEnd, Error> {
+        self.apply_if(draft, Expect::Anything).await
+    }
+
+    /// The same, where what the asker relies on is in force at that moment.
+    ///
+    /// # Errors
+    /// As [`Deploy::apply`]; [`Error::Stale`] where it is not.
+    pub async fn apply_if(&self, mut draft: LoopDraft, expect: Expect) -> Result<ApplyEnd, Error> {
         let id = plan::loop_id(&draft.name)?;
         // By digest, for the home may not have heard of the component yet.
         draft.component = self.room.library.resolve(&draft.component)?.digest.to_string();
@@ -201,7 +211,7 @@ impl Deploy {
             Some(intent) => intent.home.clone(),
             None => self.home_for(&draft).await?,
         };
-        self.changed(&home, Ask::Apply(Box::new(draft))).await
+        self.changed(&home, Ask::Apply(Box::new(draft), expect)).await
     }
 
     /// The one host that serves all points of a draft.
@@ -287,9 +297,9 @@ impl Deploy {
         }
     }
 
-    async fn amended(&self, id: &LoopId, amend: Amend) -> Result<ApplyEnd, Error> {
+    async fn amended(&self, id: &LoopId, amend: Amend, expect: Expect) -> Result<ApplyEnd, Error> {
         let home = self.room.book.home(id)?;
-        self.changed(&home, Ask::Amend(id.clone(), amend)).await
+        self.changed(&home, Ask::Amend(id.clone(), amend, expect)).await
     }
 
     async fn done(&self, id: &LoopId, ask: Ask, wait: Duration) -> Result<(), Error> {
@@ -352,8 +362,16 @@ impl Deploy {
     /// # Errors
     /// As [`Deploy::apply`].
     pub async fn swap(&self, id: &LoopId, component: &str) -> Result<ApplyEnd, Error> {
+        self.swap_if(id, component, Expect::Anything).await
+    }
+
+    /// The same, where what the asker relies on is in force at that moment.
+    ///
+    /// # Errors
+    /// As [`Deploy::apply_if`].
+    pub async fn swap_if(&self, id: &LoopId, component: &str, expect: Expect) -> Result<ApplyEnd, Error> {
         let digest = self.room.library.resolve(component)?.digest;
-        self.amended(id, Amend::Swap(digest.to_string())).await
+        self.amended(id, Amend::Swap(digest.to_string()), expect).await
     }
 
     /// Goes on with other parameters or another strategy.
@@ -361,7 +379,15 @@ impl Deploy {
     /// # Errors
     /// As [`Deploy::apply`].
     pub async fn set(&self, id: &LoopId, change: Change) -> Result<ApplyEnd, Error> {
-        self.amended(id, Amend::Set(change)).await
+        self.set_if(id, change, Expect::Anything).await
+    }
+
+    /// The same, where what the asker relies on is in force at that moment.
+    ///
+    /// # Errors
+    /// As [`Deploy::apply_if`].
+    pub async fn set_if(&self, id: &LoopId, change: Change, expect: Expect) -> Result<ApplyEnd, Error> {
+        self.amended(id, Amend::Set(change), expect).await
     }
 
     /// Goes back to an earlier revision, under a new number; to the one before where none is named.
@@ -369,7 +395,15 @@ impl Deploy {
     /// # Errors
     /// As [`Deploy::apply`]; [`Error::NotFound`] where there is no such revision.
     pub async fn rollback(&self, id: &LoopId, revision: Option<u64>) -> Result<ApplyEnd, Error> {
-        self.amended(id, Amend::Rollback(revision)).await
+        self.rollback_if(id, revision, Expect::Anything).await
+    }
+
+    /// The same, where what the asker relies on is in force at that moment.
+    ///
+    /// # Errors
+    /// As [`Deploy::rollback`]; [`Error::Stale`] where it is not.
+    pub async fn rollback_if(&self, id: &LoopId, revision: Option<u64>, expect: Expect) -> Result<ApplyEnd, Error> {
+        self.amended(id, Amend::Rollback(revision), expect).await
     }
 
     /// Ends a loop. Its outputs stay as they are.
@@ -377,7 +411,15 @@ impl Deploy {
     /// # Errors
     /// [`Error::NotFound`], [`Error::Busy`] while it is changed, [`Error::Unreachable`], [`Error::Store`].
     pub async fn delete(&self, id: &LoopId) -> Result<(), Error> {
-        self.done(id, Ask::Delete(id.clone()), APPLY_WAIT).await
+        self.delete_if(id, Expect::Anything).await
+    }
+
+    /// The same, where what the asker relies on is in force at that moment.
+    ///
+    /// # Errors
+    /// As [`Deploy::delete`]; [`Error::Stale`] where it is not.
+    pub async fn delete_if(&self, id: &LoopId, expect: Expect) -> Result<(), Error> {
+        self.done(id, Ask::Delete(id.clone(), expect), APPLY_WAIT).await
     }
 
     /// Gives the ownership to another member, between two cycles.
@@ -403,15 +445,22 @@ impl Deploy {
     /// [`Error::NotFound`], [`Error::Unreachable`], [`Error::Timeout`], [`Error::Store`] where the order shall hold over a
     /// restart and the host's disk refuses it: nothing has changed then.
     pub async fn drain(&self, host: &HostId, order: DrainOrder) -> Result<DrainEnd, Error> {
-        if !self.room.roster.all().iter().any(|(known, _)| known == host) {
-            return Err(Error::not_found(
-                format!("no host of the cell is named {host}"),
-                "list the hosts for their names",
-            ));
-        }
+        self.room.roster.known(host)?;
         let wait = DRAIN_ORDER_WAIT + ANSWER_WAIT;
         match self.room.ask(host, Ask::Drain(order), wait).await? {
             Told::Drained(end) => Ok(end),
+            _ => Err(unexpected()),
+        }
+    }
+
+    /// How well a host is, in its own words.
+    ///
+    /// # Errors
+    /// [`Error::NotFound`], [`Error::Unreachable`], [`Error::Timeout`].
+    pub async fn health(&self, host: &HostId) -> Result<HealthView, Error> {
+        self.room.roster.known(host)?;
+        match self.room.ask(host, Ask::Health, ANSWER_WAIT).await? {
+            Told::Health(view) => Ok(view),
             _ => Err(unexpected()),
         }
     }

@@ -49,6 +49,9 @@ pub enum Error {
     /// It could be right, but not with what the cell has or does now.
     #[error("{0}")]
     Refused(Words),
+    /// The loop is not at the revision that the asker counts on any more.
+    #[error("{0}")]
+    Stale(Words),
     /// A limit is reached, or another change is under way; later it may do.
     #[error("{0}")]
     Busy(Words),
@@ -74,6 +77,7 @@ impl Error {
             Self::NotFound(w)
             | Self::Invalid(w)
             | Self::Refused(w)
+            | Self::Stale(w)
             | Self::Busy(w)
             | Self::Unreachable(w)
             | Self::Timeout(w)

@@ -15,7 +15,8 @@
 //! by notices and, where those get lost, by comparing marks every second.
 //!
 //! Reading order: `draft`, `view`, `error` (what people see); `wire`, `field` (what this room speaks); `plan` (pure);
-//! `book`, `library`, `roster`, `feed` (what it keeps); `admission`, `bench`, `holder`, `home`, `preference`, `drain`, `change`, `orders` (what it does);
+//! `book`, `library`, `roster`, `feed` (what it keeps); `admission`, `bench`, `holder`, `home`, `preference`, `drain`, `expect`,
+//! `change`, `orders`, `health` (what it does);
 //! `trials` with `rehearsal`, `verdict`, `replay`, `shadows`, `curve`, `report` (looking back, and trying candidates);
 //! `rollout` (one component for many loops, by rule);
 //! `sync`, `answers`, `service`, `room`, `deploy` (how it hangs together).
@@ -28,12 +29,15 @@ mod bench;
 mod book;
 mod bundle;
 mod change;
+mod counters;
 mod curve;
 mod deploy;
 mod drain;
 mod error;
+mod expect;
 mod feed;
 mod field;
+mod health;
 mod holder;
 mod home;
 mod library;
@@ -60,11 +64,16 @@ pub mod report;
 pub mod rollout;
 pub mod view;
 
+/// The target of the spans that say how long the parts of a change take. They are for a collector; see `bumpless-telemetry`.
+pub const SPANS: &str = "bumpless::spans";
+
 pub use bumpless_store::Window;
 pub use deploy::Deploy;
 pub use draft::{Change, LoopDraft};
 pub use error::{Error, Words};
+pub use expect::Expect;
 pub use field::{CallSink, CommandSink, Field, WithdrawSink};
+pub use health::{Check, HealthView};
 pub use room::{DeployArrival, Parts};
 pub use view::{
     ApplyEnd, Call, CallEnd, CommandEnd, ComponentView, Counters, DrainEnd, DrainOrder, FailureView, HandOverView,

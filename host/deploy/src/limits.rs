@@ -94,6 +94,13 @@ pub const READY_WAIT: Duration = Duration::from_secs(20);
 /// How long a host may take for a short answer.
 pub const ANSWER_WAIT: Duration = Duration::from_secs(5);
 
+/// Time for which the end of one try to write to the disk is believed: those who watch hosts ask every few seconds, several at
+/// once, and each try waits for the disk.
+pub const DISK_TRIED_EVERY: Duration = Duration::from_secs(5);
+
+/// Longest wait for a try to write: below [`ANSWER_WAIT`], so that another host hears of a disk that hangs.
+pub const DISK_WAIT: Duration = Duration::from_secs(2);
+
 /// How long a host may take to send a component: 32 MiB over 10 Mbit/s.
 pub const FETCH_WAIT: Duration = Duration::from_secs(30);
 

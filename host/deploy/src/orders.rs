@@ -15,6 +15,7 @@ use tokio::{sync::oneshot, time::timeout};
 
 use crate::{
     error::{Error, chain},
+    expect::Expect,
     limits::{CHANGE_WAIT, COMMAND_WAIT_MAX, COMMAND_WAIT_MIN},
     masters::Mastery,
     room::Room,
@@ -110,18 +111,18 @@ impl Room {
     }
 
     /// Ends a loop. Its outputs stay as they are.
-    pub(crate) async fn delete_here(self: &Arc<Self>, id: LoopId) -> Result<(), Error> {
+    pub(crate) async fn delete_here(self: &Arc<Self>, id: LoopId, expect: Expect) -> Result<(), Error> {
         self.ours(&id)?;
         let room = Arc::clone(self);
         // A task of its own, so that an asker that goes away leaves nothing half done.
         let (sender, receiver) = oneshot::channel();
         self.spawn(async move {
-            let _ = sender.send(room.delete(&id).await);
+            let _ = sender.send(room.delete(&id, &expect).await);
         });
         receiver.await.map_err(|_| crate::bench::stopping())?
     }
 
-    async fn delete(&self, id: &LoopId) -> Result<(), Error> {
+    async fn delete(&self, id: &LoopId, expect: &Expect) -> Result<(), Error> {
         let lock = self.homes.locks.of(id);
         let taken = |_| {
             Error::busy(
@@ -130,7 +131,8 @@ impl Room {
             )
         };
         let _turn = timeout(CHANGE_WAIT, lock.lock()).await.map_err(taken)?;
-        self.ours(id)?;
+        let intent = self.ours(id)?;
+        expect.check(id, Some(intent.current.revision))?;
         // On disk first: a loop that was said to be gone must not come back.
         let tombstone = self.book.remove(id).await?;
         self.homes.closed(id);

@@ -14,7 +14,7 @@ use std::{
         Arc,
         atomic::{AtomicBool, AtomicU64, Ordering},
     },
-    time::{Duration, Instant},
+    time::Duration,
 };
 
 use bumpless_cell::{Arrival, Probe, Roles, Session, Vitals};
@@ -39,6 +39,7 @@ use crate::{
     error::{Error, Words, chain},
     feed::Feed,
     field::Field,
+    health::Disk,
     holder::Holder,
     home::Homes,
     library::Library,
@@ -48,7 +49,6 @@ use crate::{
     rollout::ledger::Ledger,
     roster::Roster,
     shadows::Shadows,
-    view::Counters,
     wire::{self, Ask, Notice, Told},
 };
 
@@ -152,6 +152,8 @@ pub(crate) struct Room {
     pub(crate) rollouts: Ledger,
     pub(crate) alarms: Alarms,
     pub(crate) commissioning: Commissioning,
+    /// Whether the disk takes writes, as it was when it was last tried.
+    pub(crate) disk: Disk,
     /// Replays and backtests.
     pub(crate) rehearsals: Semaphore,
     pub(crate) holder: Holder,
@@ -234,6 +236,7 @@ impl Room {
             rollouts: Ledger::default(),
             alarms: Alarms::default(),
             commissioning: Commissioning::new(&store, clock)?,
+            disk: Disk::default(),
             rehearsals: Semaphore::new(REHEARSALS_MAX),
             holder: Holder::default(),
             homes: Homes::default(),
@@ -537,48 +540,6 @@ impl Room {
             }
             room.keep_holds().await;
         }
-    }
-
-    /// What this host counts.
-    pub(crate) fn counters(&self) -> Counters {
-        let now = Instant::now();
-        let get = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
-        let log = self.cycles.as_ref().map(|cycles| cycles.counts()).unwrap_or_default();
-        let mut counters = Counters {
-            hosts_alive: self.roster.all().iter().filter(|(_, seen)| seen.alive(now)).count() as u64,
-            loops_known: self.book.len() as u64,
-            loops_held: self.holder.len() as u64,
-            loops_owned: u64::from(self.field.owned()),
-            components: self.library.len() as u64,
-            records: self.feed.count(),
-            uploads: get(&self.tallies.uploads),
-            uploads_refused: get(&self.tallies.uploads_refused),
-            applies: get(&self.tallies.applies),
-            applies_refused: get(&self.tallies.applies_refused),
-            fetches: get(&self.tallies.fetches),
-            fetches_failed: get(&self.tallies.fetches_failed),
-            fetches_corrupt: get(&self.tallies.fetches_corrupt),
-            prepares_failed: get(&self.tallies.prepares_failed),
-            requests: get(&self.tallies.requests),
-            malformed: get(&self.tallies.malformed),
-            arrivals_dropped: get(&self.tallies.arrivals_dropped),
-            cycles_recorded: log.written,
-            cycles_unrecorded: log.dropped,
-            cycle_log_damaged: log.damaged,
-            cycle_log_bytes: log.bytes,
-            ..Counters::default()
-        };
-        for intent in self.book.all().iter().filter(|intent| intent.home == self.here) {
-            counters.loops_home += 1;
-            if let Some(view) = self.field.home_view(&intent.loop_id) {
-                counters.cycles_taken += view.tally.taken;
-                counters.cycles_lost += view.tally.lost;
-                counters.cycles_skipped += view.tally.skipped;
-                counters.takeovers += view.tally.takeovers;
-                counters.commits_refused += view.tally.refused;
-            }
-        }
-        counters
     }
 }
 

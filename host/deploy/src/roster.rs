@@ -18,7 +18,10 @@ use bumpless_cell::Vitals;
 use bumpless_core::{HostId, place::Candidate};
 use parking_lot::Mutex;
 
-use crate::limits::{GONE_SHOWN, HOSTS_MAX, VITALS_FRESH};
+use crate::{
+    error::Error,
+    limits::{GONE_SHOWN, HOSTS_MAX, VITALS_FRESH},
+};
 
 /// One host.
 #[derive(Debug, Clone)]
@@ -115,6 +118,20 @@ impl Roster {
     /// Everyone that is shown, by name.
     pub(crate) fn all(&self) -> Vec<(HostId, Seen)> {
         self.seen.lock().iter().map(|(h, s)| (h.clone(), s.clone())).collect()
+    }
+
+    /// Is there a host of that name, be it gone?
+    ///
+    /// # Errors
+    /// [`Error::NotFound`].
+    pub(crate) fn known(&self, host: &HostId) -> Result<(), Error> {
+        if self.seen.lock().contains_key(host) {
+            return Ok(());
+        }
+        Err(Error::not_found(
+            format!("no host of the cell is named {host}"),
+            "list the hosts for their names",
+        ))
     }
 
     /// Is the host there?

@@ -13,8 +13,10 @@ use bumpless_core::{
     limits::TEXT_CHARS_MAX,
 };
 use tokio::time::timeout;
+use tracing::{Instrument as _, info_span};
 
 use crate::{
+    SPANS,
     admission::let_in,
     bench::{engine_error, stopping},
     book::on_disk,
@@ -43,7 +45,9 @@ fn check_words(by: &str, note: &str) -> Result<(), Error> {
 impl Room {
     /// Takes a component in.
     pub(crate) async fn upload(self: &Arc<Self>, bytes: Vec<u8>, upload: &Upload) -> Result<Arc<ComponentInfo>, Error> {
-        let end = self.take_in(bytes.into(), upload).await;
+        let span =
+            info_span!(target: SPANS, "upload", bytes = bytes.len(), by = upload.by, name = tracing::field::Empty);
+        let end = self.take_in(bytes.into(), upload).instrument(span).await;
         count(if end.is_ok() {
             &self.tallies.uploads
         } else {
@@ -80,7 +84,9 @@ impl Room {
             return Ok(((*known).clone(), true));
         }
         let (engine, copy) = (self.bench.engine.clone(), Arc::clone(bytes));
+        // Inspected here, compiled in a process of its own.
         let (inspection, prepared) = on_disk(move || engine.open(&copy))
+            .instrument(info_span!(target: SPANS, "compile"))
             .await?
             .map_err(|error| engine_error(&error))?;
         let (name, version) = (
@@ -107,7 +113,9 @@ impl Room {
         if self.library.admit(&info)?.is_some() {
             return Ok((info, true));
         }
-        let admission = self.tried(prepared, &info.imports, inspection.compile_time).await?;
+        tracing::Span::current().record("name", title(&info));
+        let trial = self.tried(prepared, &info.imports, inspection.compile_time);
+        let admission = trial.instrument(info_span!(target: SPANS, "trial")).await?;
         info.admission = Some(admission);
         info.check().map_err(|error| Error::invalid(error.to_string(), ""))?;
         Ok((info, false))
@@ -148,7 +156,8 @@ impl Room {
             let what = if forced { "taken in by force" } else { "uploaded" };
             info.remember(info.uploaded_at_unix_ms, &upload.by, what);
             let info = Arc::new(info);
-            self.library.keep(Arc::clone(&info), Some(bytes)).await?;
+            let kept = self.library.keep(Arc::clone(&info), Some(bytes));
+            kept.instrument(info_span!(target: SPANS, "keep")).await?;
             info
         };
         self.announce(&Notice::Component(info.digest, info.edition()));

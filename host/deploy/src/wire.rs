@@ -17,13 +17,15 @@ use crate::{
     commissioning::{FieldAsk, FieldEvent, FieldTold},
     draft::{Change, LoopDraft},
     error::{Error, Words},
+    expect::Expect,
+    health::HealthView,
     report::{CyclesView, ReplayReport, ShadowView, Trial, TrialReport},
     rollout::RolloutView,
     view::{ApplyEnd, CommandEnd, DrainEnd, DrainOrder, PointView, Stage},
 };
 
 /// Version of these lists. Another one is refused in words, so that a half updated cell says what is the matter.
-const VERSION: u8 = 3;
+const VERSION: u8 = 4;
 
 /// A position of an intent among its copies: see [`Intent::position`].
 pub(crate) type Position = (u64, u64);
@@ -31,18 +33,20 @@ pub(crate) type Position = (u64, u64);
 /// What a host may be asked.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) enum Ask {
-    /// To the home: create or change a loop.
-    Apply(Box<LoopDraft>),
-    /// To the home: change a loop by a part.
-    Amend(LoopId, Amend),
+    /// To the home: create or change a loop, where this is in force.
+    Apply(Box<LoopDraft>, Expect),
+    /// To the home: change a loop by a part, where this is in force.
+    Amend(LoopId, Amend, Expect),
     /// To the home: an operator's command.
     Command(LoopId, Command),
-    /// To the home: end the loop.
-    Delete(LoopId),
+    /// To the home: end the loop, where this is in force.
+    Delete(LoopId, Expect),
     /// To the home: give the ownership to another member.
     Move(LoopId, HostId),
     /// To a host: give your loops away, or take loops again.
     Drain(DrainOrder),
+    /// To a host: are you well?
+    Health,
     /// To a member: could you run this? Nothing stays.
     Try(Box<LoopSpec>),
     /// To a member: make this revision of the intent ready, and say when it is.
@@ -183,6 +187,8 @@ pub(crate) enum Told {
     Commanded(CommandEnd),
     /// How far a host is with being emptied, or filled again.
     Drained(DrainEnd),
+    /// How well a host is.
+    Health(HealthView),
     /// Which of the points are served there, in the order of the question.
     Found(Vec<bool>),
     /// A page of points, and how many there are in all.
@@ -338,7 +344,11 @@ mod tests {
             prefer: vec!["a".into()],
             policy: Policy::default(),
         };
-        for ask in [Ask::Apply(Box::new(draft)), Ask::Library, Ask::Points(7)] {
+        for ask in [
+            Ask::Apply(Box::new(draft), Expect::OneOf(vec![3])),
+            Ask::Library,
+            Ask::Points(7),
+        ] {
             assert_eq!(decode::<Ask>("question", &encode(&ask).unwrap()).unwrap(), ask);
         }
         let refusal = Err(Error::refused("a", "b"));

@@ -251,7 +251,9 @@ const fn exception_of(error: &Error) -> Exception {
         Error::Invalid(_) => Exception::VALUE,
         Error::Busy(_) => Exception::BUSY,
         Error::Unreachable(_) | Error::Timeout(_) => Exception::TARGET,
-        Error::NotFound(_) | Error::Refused(_) | Error::Store(_) | Error::Internal(_) => Exception::FAILURE,
+        Error::NotFound(_) | Error::Refused(_) | Error::Stale(_) | Error::Store(_) | Error::Internal(_) => {
+            Exception::FAILURE
+        }
     }
 }
 

@@ -39,6 +39,19 @@ async function ask<T>(method: string, path: string, body?: BodyInit, headers: Re
 
 export const get = <T>(path: string): Promise<T> => ask("GET", path);
 
+/** A list in all its parts. `rows` is the key of its rows. */
+export async function list<T>(path: string, rows: string): Promise<T[]> {
+  const all: T[] = [];
+  let after = "";
+  do {
+    const from = after && `${path.includes("?") ? "&" : "?"}after=${encodeURIComponent(after)}`;
+    const part = await get<Record<string, unknown>>(path + from);
+    all.push(...((part[rows] as T[] | undefined) ?? []));
+    after = (part["next"] as string | null | undefined) ?? "";
+  } while (after);
+  return all;
+}
+
 /** Also what has no body to send says that it is JSON: a page of another origin could not. */
 export const send = <T>(method: string, path: string, body: unknown, headers: Record<string, string> = {}): Promise<T> =>
   ask(method, path, JSON.stringify(body), { "content-type": "application/json", ...headers });

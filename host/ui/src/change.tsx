@@ -9,7 +9,7 @@
 import { signal, type Signal } from "@preact/signals";
 import { useEffect, useRef } from "preact/hooks";
 import uPlot from "uplot";
-import { get, remove, send, upload, words } from "./api";
+import { get, list, remove, send, upload, words } from "./api";
 import { bytes, clock, decimals, duration_us, value } from "./format";
 import { actuate, type Followed, load_specs, loops, measure, notices } from "./live";
 import { colour, colours } from "./theme";
@@ -59,7 +59,7 @@ export async function take_file(loop: string, file: File): Promise<void> {
 export function Change(props: { name: string }) {
   const loop = loops.value.get(props.name);
   useEffect(() => {
-    get<{ components: Component[] }>("/v1/components").then((all) => (library.value = all.components), complain);
+    list<Component>("/v1/components", "components").then((all) => (library.value = all), complain);
   }, [props.name]);
   if (!loop) return <None what={`There is no loop ${props.name} (any more).`} />;
   return <ChangeOf key={props.name} loop={loop} />;

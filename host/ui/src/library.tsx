@@ -2,7 +2,7 @@
 
 import { signal } from "@preact/signals";
 import { useEffect, useRef, useState } from "preact/hooks";
-import { get, remove, send, upload, words } from "./api";
+import { get, list, remove, send, upload, words } from "./api";
 import { AdmissionReport } from "./change";
 import { bytes, when, zone } from "./format";
 import { loops } from "./live";
@@ -16,7 +16,7 @@ const text_filter = signal("");
 
 async function load(): Promise<void> {
   try {
-    all.value = (await get<{ components: Component[] }>("/v1/components")).components;
+    all.value = await list<Component>("/v1/components", "components");
   } catch (error) {
     complain(error);
   }

@@ -6,7 +6,7 @@
 // Never: a command, or a request besides the feed and the lists that it tells to be old.
 
 import { batch, computed, signal, type Signal } from "@preact/signals";
-import { get, words } from "./api";
+import { get, list, words } from "./api";
 import type { Host, Loop, Notice, Point, Row, Rows, Standing, Trend } from "./types";
 
 /** Longest silence of a connection that is alive: hosts are told every second. */
@@ -269,8 +269,8 @@ export async function load_specs(): Promise<void> {
 /** Reads the points again. */
 export async function load_points(): Promise<void> {
   try {
-    const all = await get<{ points: Point[] }>("/v1/points");
-    points.value = new Map(all.points.map((point) => [point.name, point]));
+    const all = await list<Point>("/v1/points", "points");
+    points.value = new Map(all.map((point) => [point.name, point]));
   } catch (error) {
     trouble.value = words(error);
   }

@@ -2,7 +2,7 @@
 
 import { signal } from "@preact/signals";
 import { useEffect, useState } from "preact/hooks";
-import { get, send } from "./api";
+import { get, list, send } from "./api";
 import { value, when } from "./format";
 import { loops } from "./live";
 import type { Component, Rollout } from "./types";
@@ -13,7 +13,7 @@ const components = signal<Component[]>([]);
 
 async function load(): Promise<void> {
   try {
-    all.value = (await get<{ rollouts: Rollout[] }>("/v1/rollouts")).rollouts;
+    all.value = await list<Rollout>("/v1/rollouts", "rollouts");
   } catch (error) {
     complain(error);
   }
@@ -22,7 +22,7 @@ async function load(): Promise<void> {
 export function Rollouts(props: { id: string }) {
   useEffect(() => {
     void load();
-    get<{ components: Component[] }>("/v1/components").then((found) => (components.value = found.components), complain);
+    list<Component>("/v1/components", "components").then((found) => (components.value = found), complain);
     const every = setInterval(() => void load(), 2_000);
     return () => clearInterval(every);
   }, []);

@@ -17,7 +17,9 @@ use utoipa::IntoParams;
 use crate::{
     error::{Kind, Problem},
     extract::{InPath, InQuery, Json, body_bytes, content_type, discard, words},
+    paging::{Listed, Order, Page},
     server::{App, finish},
+    tag::{Conditions, Tag, Tagged},
     types::{CallAnswer, CallRequest, Component, Components, RelabelRequest},
 };
 
@@ -37,6 +39,26 @@ fn seen(app: &App, info: ComponentInfo) -> Component {
     .into()
 }
 
+/// What people wrote about a component; its bytes never change.
+fn tag(info: &ComponentInfo) -> Tag {
+    Tag::of(&(info.digest.to_string(), &info.note, &info.labels))
+}
+
+/// Is the component as the asker counts on? What is given back is held while it is changed. Changes at other hosts in the same
+/// moment are not seen: copies follow each other, and the later one counts.
+async fn as_expected<'a>(
+    app: &'a App,
+    conditions: &Conditions,
+    reference: &str,
+) -> Result<Option<tokio::sync::MutexGuard<'a, ()>>, Problem> {
+    if !conditions.given() {
+        return Ok(None);
+    }
+    let turn = app.conditional.lock().await;
+    conditions.check(Some(&tag(&app.cell.resolve(reference)?)))?;
+    Ok(Some(turn))
+}
+
 /// Which components are listed; all of what is given must hold.
 #[derive(Debug, Default, Deserialize, IntoParams)]
 #[into_params(parameter_in = Query)]
@@ -48,6 +70,11 @@ pub(crate) struct ListQuery {
     name: Option<String>,
     /// A part of name, description, note, labels or uploader, in any case of letters.
     text: Option<String>,
+    /// Only what comes after this one, `name@version`: `next` of the part before.
+    after: Option<String>,
+    /// At most so many, 1 to 10,000; 1,000 where not given.
+    #[param(minimum = 1, maximum = 10_000)]
+    limit: Option<usize>,
 }
 
 impl ListQuery {
@@ -73,11 +100,24 @@ impl ListQuery {
     responses(
         (status = 200, description = "The library, by name and version", body = Components),
         (status = "default", description = "What went wrong", body = Problem, content_type = "application/problem+json")))]
-pub(crate) async fn list(State(app): State<App>, InQuery(query): InQuery<ListQuery>) -> JsonAnswer<Components> {
-    let all = app.cell.components().into_iter();
-    JsonAnswer(Components {
-        components: all.filter(|view| query.takes(&view.info)).map(Into::into).collect(),
-    })
+pub(crate) async fn list(
+    State(app): State<App>,
+    InQuery(query): InQuery<ListQuery>,
+) -> Result<Listed<Components>, Problem> {
+    let page = Page::of(query.limit, query.after.clone())?;
+    let mut views = app.cell.components();
+    views.retain(|view| query.takes(&view.info));
+    let title = |view: &ComponentView| format!("{}@{}", view.info.name, view.info.version);
+    // Versions go by their numbers, not by their letters.
+    let (views, next) = page.cut(views, Order::Otherwise, title)?;
+    let components = views.into_iter().map(Into::into).collect();
+    Ok(Listed(
+        Components {
+            components,
+            next: next.clone(),
+        },
+        next,
+    ))
 }
 
 /// What may be said about an upload.
@@ -190,12 +230,14 @@ pub(crate) async fn upload(
 pub(crate) async fn show(
     State(app): State<App>,
     InPath(reference): InPath<String>,
-) -> Result<JsonAnswer<Component>, Problem> {
+    conditions: Conditions,
+) -> Result<Tagged<Component>, Problem> {
     let info = app.cell.resolve(&reference)?;
+    let tag = tag(&info);
     let stages = app.cell.stages(info.digest).await?;
     let mut component = seen(&app, info);
     component.hosts = Some(stages.into_iter().map(Into::into).collect());
-    Ok(JsonAnswer(component))
+    Ok(Tagged::read(&conditions, tag, component))
 }
 
 /// Changes labels and note of a component, on every host.
@@ -209,9 +251,10 @@ pub(crate) async fn show(
 pub(crate) async fn relabel(
     State(app): State<App>,
     InPath(reference): InPath<String>,
+    conditions: Conditions,
     headers: HeaderMap,
     Json(request): Json<RelabelRequest>,
-) -> Result<JsonAnswer<Component>, Problem> {
+) -> Result<Tagged<Component>, Problem> {
     let note = request
         .note
         .map(|note| words(Some(note), &headers, "note"))
@@ -222,8 +265,9 @@ pub(crate) async fn relabel(
         note,
         labels: request.labels,
     };
+    let _turn = as_expected(&app, &conditions, &reference).await?;
     let info = finish(app.cell.relabel(reference, change)).await?;
-    Ok(JsonAnswer(seen(&app, info)))
+    Ok(Tagged::changed(StatusCode::OK, tag(&info), seen(&app, info)))
 }
 
 /// Downloads a component's bytes.
@@ -231,8 +275,16 @@ pub(crate) async fn relabel(
     responses(
         (status = 200, description = "The component's bytes", body = Vec<u8>, content_type = "application/wasm"),
         (status = "default", description = "What went wrong", body = Problem, content_type = "application/problem+json")))]
-pub(crate) async fn bytes(State(app): State<App>, InPath(reference): InPath<String>) -> Result<Response, Problem> {
+pub(crate) async fn bytes(
+    State(app): State<App>,
+    InPath(reference): InPath<String>,
+    conditions: Conditions,
+) -> Result<Response, Problem> {
     let info = app.cell.resolve(&reference)?;
+    let tag = Tag::digest(&info.digest);
+    if conditions.has(&tag) {
+        return Ok(Tagged::read(&conditions, tag, ()).into_response());
+    }
     let bytes = app.cell.component_bytes(info.digest).await?;
     // A descriptor's name and version are letters, digits, dashes and dots, so they are safe in a header.
     let name = format!("attachment; filename=\"{}-{}.wasm\"", info.name, info.version);
@@ -240,7 +292,7 @@ pub(crate) async fn bytes(State(app): State<App>, InPath(reference): InPath<Stri
     if let Ok(name) = HeaderValue::from_str(&name) {
         response.headers_mut().insert(header::CONTENT_DISPOSITION, name);
     }
-    if let Ok(tag) = HeaderValue::from_str(&format!("\"{}\"", info.digest)) {
+    if let Some(tag) = tag.header() {
         response.headers_mut().insert(header::ETAG, tag);
     }
     Ok(response)
@@ -252,7 +304,12 @@ pub(crate) async fn bytes(State(app): State<App>, InPath(reference): InPath<Stri
         (status = 204, description = "Removed"),
         (status = 409, description = "A loop uses it", body = Problem, content_type = "application/problem+json"),
         (status = "default", description = "What went wrong", body = Problem, content_type = "application/problem+json")))]
-pub(crate) async fn remove(State(app): State<App>, InPath(reference): InPath<String>) -> Result<StatusCode, Problem> {
+pub(crate) async fn remove(
+    State(app): State<App>,
+    InPath(reference): InPath<String>,
+    conditions: Conditions,
+) -> Result<StatusCode, Problem> {
+    let _turn = as_expected(&app, &conditions, &reference).await?;
     finish(app.cell.remove_component(reference)).await?;
     Ok(StatusCode::NO_CONTENT)
 }

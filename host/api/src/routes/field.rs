@@ -7,12 +7,15 @@ use axum::{
     response::{IntoResponse as _, Response},
 };
 use bumpless_core::PointId;
+use serde::Deserialize;
+use utoipa::IntoParams;
 
 use crate::{
     error::Problem,
-    extract::{InPath, Json},
+    extract::{InPath, InQuery, Json},
+    paging::{Listed, Order, Page},
     server::App,
-    types::{Buses, ByRequest, ForceRequest, Job, JobRequest, Jobs, Point, WriteRequest},
+    types::{Bus, Buses, ByRequest, ForceRequest, Job, JobRequest, JobState, Jobs, Point, WriteRequest},
 };
 
 /// Shows a point with its value, its quality and who holds it.
@@ -79,16 +82,43 @@ pub(crate) async fn unforce(
     ))
 }
 
-/// Lists the buses of all hosts: how their devices are, and which jobs they know.
-#[utoipa::path(get, operation_id = "list_buses", path = "/v1/buses", tag = "field",
-    responses(
-        (status = 200, description = "The buses, by name", body = Buses),
-        (status = "default", description = "What went wrong", body = Problem, content_type = "application/problem+json")))]
-pub(crate) async fn buses(State(app): State<App>) -> Result<JsonAnswer<Buses>, Problem> {
-    let buses = app.cell.buses().await?;
-    Ok(JsonAnswer(Buses {
-        buses: buses.into_iter().map(Into::into).collect(),
-    }))
+/// Which buses, and which part of the list; all of what is given must hold.
+#[derive(Debug, Deserialize, IntoParams)]
+#[into_params(parameter_in = Query)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct BusesQuery {
+    /// Only buses of this host.
+    host: Option<String>,
+    /// Only buses whose device answers, or does not.
+    connected: Option<bool>,
+    /// Only what comes after this: `next` of the part before, `bus@host`.
+    after: Option<String>,
+    /// At most so many, 1 to 10,000; 1,000 where not given.
+    #[param(minimum = 1, maximum = 10_000)]
+    limit: Option<usize>,
+}
+
+/// Lists the buses of all hosts, by name: how their devices are, and which jobs they know.
+#[utoipa::path(get, operation_id = "list_buses", path = "/v1/buses", tag = "field", params(BusesQuery),
+    responses((status = 200, description = "The buses", body = Buses)))]
+pub(crate) async fn buses(
+    State(app): State<App>,
+    InQuery(query): InQuery<BusesQuery>,
+) -> Result<Listed<Buses>, Problem> {
+    let page = Page::of(query.limit, query.after)?;
+    let mut buses: Vec<Bus> = app.cell.buses().await?.into_iter().map(Into::into).collect();
+    buses.retain(|bus| {
+        query.host.as_ref().is_none_or(|host| *host == bus.host)
+            && query.connected.is_none_or(|connected| connected == bus.connected)
+    });
+    let (buses, next) = page.cut(buses, Order::Otherwise, |bus| format!("{}@{}", bus.name, bus.host))?;
+    Ok(Listed(
+        Buses {
+            buses,
+            next: next.clone(),
+        },
+        next,
+    ))
 }
 
 /// Takes a job in: this is the first of its two replies. What becomes of it is at the address in `location`, and on the
@@ -110,16 +140,43 @@ pub(crate) async fn start(State(app): State<App>, Json(request): Json<JobRequest
     Ok(response)
 }
 
+/// Which jobs, and which part of the list; all of what is given must hold.
+#[derive(Debug, Deserialize, IntoParams)]
+#[into_params(parameter_in = Query)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct JobsQuery {
+    /// Only jobs of this host.
+    host: Option<String>,
+    /// Only jobs of this bus.
+    bus: Option<String>,
+    /// Only jobs in this state.
+    state: Option<JobState>,
+    /// Only what comes after this: `next` of the part before, a job's id.
+    after: Option<String>,
+    /// At most so many, 1 to 10,000; 1,000 where not given.
+    #[param(minimum = 1, maximum = 10_000)]
+    limit: Option<usize>,
+}
+
 /// Lists the jobs of all hosts, those that ended a while ago too, without their results.
-#[utoipa::path(get, operation_id = "list_jobs", path = "/v1/jobs", tag = "field",
-    responses(
-        (status = 200, description = "The jobs, oldest first", body = Jobs),
-        (status = "default", description = "What went wrong", body = Problem, content_type = "application/problem+json")))]
-pub(crate) async fn jobs(State(app): State<App>) -> Result<JsonAnswer<Jobs>, Problem> {
-    let jobs = app.cell.jobs().await?;
-    Ok(JsonAnswer(Jobs {
-        jobs: jobs.into_iter().map(Into::into).collect(),
-    }))
+#[utoipa::path(get, operation_id = "list_jobs", path = "/v1/jobs", tag = "field", params(JobsQuery),
+    responses((status = 200, description = "The jobs, oldest first", body = Jobs)))]
+pub(crate) async fn jobs(State(app): State<App>, InQuery(query): InQuery<JobsQuery>) -> Result<Listed<Jobs>, Problem> {
+    let page = Page::of(query.limit, query.after)?;
+    let mut jobs: Vec<Job> = app.cell.jobs().await?.into_iter().map(Into::into).collect();
+    jobs.retain(|job| {
+        query.host.as_ref().is_none_or(|host| *host == job.host)
+            && query.bus.as_ref().is_none_or(|bus| *bus == job.bus)
+            && query.state.is_none_or(|state| state == job.state)
+    });
+    let (jobs, next) = page.cut(jobs, Order::Otherwise, |job| job.id.clone())?;
+    Ok(Listed(
+        Jobs {
+            jobs,
+            next: next.clone(),
+        },
+        next,
+    ))
 }
 
 /// Shows a job with its result so far: once it has ended, the second of its two replies.

@@ -10,6 +10,7 @@ use crate::{
     error::{Kind, Problem},
     extract::{InPath, InQuery, Json},
     limits::CYCLES_DEFAULT,
+    paging::{Listed, Order, Page},
     server::App,
     types::{BacktestRequest, Cycles, Record, Replay, ReplayRequest, Shadow, ShadowRequest, Shadows, Trial, window},
 };
@@ -30,7 +31,10 @@ pub(crate) struct CyclesQuery {
     from_unix_us: Option<u64>,
     /// Up to this time.
     to_unix_us: Option<u64>,
+    /// The part after this time, in ns: `next` of the part before. Then `last` and `from_unix_us` do not count.
+    after: Option<u64>,
     /// At most so many, 1 to 1,000; 1,000 where not given.
+    #[param(minimum = 1, maximum = 1_000)]
     limit: Option<u32>,
     /// With the controllers' states.
     #[serde(default)]
@@ -47,28 +51,39 @@ pub(crate) async fn cycles(
     State(app): State<App>,
     InPath(name): InPath<String>,
     InQuery(query): InQuery<CyclesQuery>,
-) -> Result<JsonAnswer<Cycles>, Problem> {
+) -> Result<Listed<Cycles>, Problem> {
     let said = query.last.is_some() || query.from_unix_us.is_some() || query.to_unix_us.is_some();
-    let window = if said {
+    let mut window = if said {
         asked(query.last.as_deref(), query.from_unix_us, query.to_unix_us)?
     } else {
         Window::Last(CYCLES_DEFAULT)
     };
+    if let Some(after) = query.after {
+        let end = match window {
+            Window::Between(_, end) => end,
+            Window::Last(_) | Window::Recent(_) => u64::MAX,
+        };
+        window = Window::Between(after.saturating_add(1), end);
+    }
     let limit = query.limit.unwrap_or(1_000);
     if !(1..=1_000).contains(&limit) {
         return Err(Problem::new(Kind::Invalid, format!("limit = {limit}"), "use 1 to 1000"));
     }
     let id = LoopId::new(&name)?;
     let view = app.cell.cycles(id, window, limit).await?;
+    let next = view.records.last().filter(|_| view.more);
+    let next = next.map(|record| record.at_ns.to_string());
     let records = view.records.iter();
-    Ok(JsonAnswer(Cycles {
+    let cycles = Cycles {
         loop_name: name,
         records: records
             .map(|record| Record::new(record, &app.ports(&record.digest), query.state))
             .collect(),
         more: view.more,
+        next: next.clone(),
         unread: view.unread,
-    }))
+    };
+    Ok(Listed(cycles, next))
 }
 
 /// Makes the recorded steps of a window again, each through the component and from the state that it was made with, and
@@ -129,19 +144,37 @@ pub(crate) async fn start_shadow(
     Ok((StatusCode::CREATED, JsonAnswer(Shadow::from(view))).into_response())
 }
 
+/// Which part of the list.
+#[derive(Debug, Deserialize, IntoParams)]
+#[into_params(parameter_in = Query)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct ShadowsQuery {
+    /// Only what comes after this: `next` of the part before, a shadow's number.
+    after: Option<String>,
+    /// At most so many, 1 to 10,000; 1,000 where not given.
+    #[param(minimum = 1, maximum = 10_000)]
+    limit: Option<usize>,
+}
+
 /// Lists the shadows of a loop, those that ended a while ago too.
-#[utoipa::path(get, operation_id = "list_shadows", path = "/v1/loops/{name}/shadows", tag = "history", params(("name" = String, Path)),
-    responses(
-        (status = 200, description = "The shadows", body = Shadows),
-        (status = "default", description = "What went wrong", body = Problem, content_type = "application/problem+json")))]
+#[utoipa::path(get, operation_id = "list_shadows", path = "/v1/loops/{name}/shadows", tag = "history", params(("name" = String, Path), ShadowsQuery),
+    responses((status = 200, description = "The shadows", body = Shadows)))]
 pub(crate) async fn shadows(
     State(app): State<App>,
     InPath(name): InPath<String>,
-) -> Result<JsonAnswer<Shadows>, Problem> {
+    InQuery(query): InQuery<ShadowsQuery>,
+) -> Result<Listed<Shadows>, Problem> {
+    let page = Page::of(query.limit, query.after)?;
     let views = app.cell.shadows(LoopId::new(&name)?).await?;
-    Ok(JsonAnswer(Shadows {
-        shadows: views.into_iter().map(Into::into).collect(),
-    }))
+    let shadows: Vec<Shadow> = views.into_iter().map(Into::into).collect();
+    let (shadows, next) = page.cut(shadows, Order::Otherwise, |shadow| shadow.id.to_string())?;
+    Ok(Listed(
+        Shadows {
+            shadows,
+            next: next.clone(),
+        },
+        next,
+    ))
 }
 
 /// Shows what a shadow found so far.

@@ -240,7 +240,7 @@ impl Feed {
                 biased;
                 _ = self.stop.wait_for(|stop| *stop) => return None,
                 _ = self.hosts.tick() => {
-                    let hosts = Hosts { hosts: self.app.cell.hosts().into_iter().map(Into::into).collect() };
+                    let hosts = Hosts { hosts: self.app.cell.hosts().into_iter().map(Into::into).collect(), next: None };
                     Event::default().event("hosts").json_data(hosts)
                 }
                 news = self.news.recv() => match news {

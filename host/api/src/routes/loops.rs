@@ -2,12 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use axum::{
-    Json as JsonAnswer,
-    extract::State,
-    http::StatusCode,
-    response::{IntoResponse as _, Response},
-};
+use axum::{Json as JsonAnswer, extract::State, http::StatusCode};
 use bumpless_core::{CommandBody, CommandId, Direction, HostId, LoopId, Outcome};
 use bumpless_deploy::{Change, LoopView};
 use serde::Deserialize;
@@ -16,8 +11,9 @@ use utoipa::IntoParams;
 use crate::{
     error::{Kind, Problem},
     extract::{IdempotencyKey, InPath, InQuery, Json},
-    limits::{PAGE_DEFAULT, PAGE_MAX},
+    paging::{Listed, Order, Page},
     server::{App, finish},
+    tag::{Conditions, Tag, Tagged},
     types::{
         Apply, Command, Depth, Loop, LoopDraft, Loops, ModeRequest, MoveRequest, OutputRequest, RollbackRequest,
         SetRequest, SetpointRequest, SwapRequest,
@@ -30,46 +26,58 @@ fn shaped(app: &App, view: LoopView, depth: Depth) -> Loop {
     Loop::new(view, &ports, depth)
 }
 
-/// Which part of the list.
+/// Which loops, and which part of the list; all of what is given must hold.
 #[derive(Debug, Deserialize, IntoParams)]
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct ListQuery {
-    /// Only loops whose names come after this one.
+    /// Only loops whose names come after this one: `next` of the part before.
     after: Option<String>,
     /// At most so many, 1 to 10,000; 1,000 where not given.
+    #[param(minimum = 1, maximum = 10_000)]
     limit: Option<usize>,
+    /// Only loops whose points this host serves.
+    home: Option<String>,
+    /// Only loops whose last cycle this host ran.
+    owner: Option<String>,
+    /// Only loops that run this component: `name` or `name@version`.
+    component: Option<String>,
+    /// A part of the loop's name, in any case of letters.
+    text: Option<String>,
+}
+
+impl ListQuery {
+    fn takes(&self, view: &LoopView) -> bool {
+        let name = view.component.split('@').next();
+        let text = self.text.as_deref().unwrap_or_default().to_lowercase();
+        let owner = || view.last.as_ref().map(|record| record.owner.as_str());
+        self.home.as_ref().is_none_or(|home| *home == view.home.as_str())
+            && self.owner.as_ref().is_none_or(|host| owner() == Some(host))
+            && (self.component.as_ref()).is_none_or(|asked| *asked == view.component || name == Some(asked))
+            && view.id.as_str().contains(&text)
+    }
 }
 
 /// Lists the loops, by name.
 #[utoipa::path(get, operation_id = "list_loops", path = "/v1/loops", tag = "loops", params(ListQuery),
-    responses(
-        (status = 200, description = "The loops", body = Loops),
-        (status = "default", description = "What went wrong", body = Problem, content_type = "application/problem+json")))]
-pub(crate) async fn list(
-    State(app): State<App>,
-    InQuery(query): InQuery<ListQuery>,
-) -> Result<JsonAnswer<Loops>, Problem> {
-    let limit = query.limit.unwrap_or(PAGE_DEFAULT);
-    if !(1..=PAGE_MAX).contains(&limit) {
-        return Err(Problem::new(
-            Kind::Invalid,
-            format!("limit = {limit}"),
-            format!("use 1 to {PAGE_MAX}"),
-        ));
-    }
-    let after = query.after.unwrap_or_default();
+    responses((status = 200, description = "The loops", body = Loops)))]
+pub(crate) async fn list(State(app): State<App>, InQuery(query): InQuery<ListQuery>) -> Result<Listed<Loops>, Problem> {
+    let page = Page::of(query.limit, query.after.clone())?;
     let mut views = app.cell.loops();
-    views.retain(|view| view.id.as_str() > after.as_str());
+    views.retain(|view| query.takes(view));
     views.sort_by(|a, b| a.id.cmp(&b.id));
-    let more = views.len() > limit;
-    views.truncate(limit);
-    let next = views.last().filter(|_| more).map(|view| view.id.to_string());
+    let (views, next) = page.cut(views, Order::ByKey, |view| view.id.to_string())?;
     let loops = views
         .into_iter()
         .map(|view| shaped(&app, view, Depth::Numbers))
         .collect();
-    Ok(JsonAnswer(Loops { loops, next }))
+    Ok(Listed(
+        Loops {
+            loops,
+            next: next.clone(),
+        },
+        next,
+    ))
 }
 
 /// How much of the last record.
@@ -91,13 +99,12 @@ pub(crate) async fn show(
     State(app): State<App>,
     InPath(name): InPath<String>,
     InQuery(query): InQuery<ShowQuery>,
-) -> Result<JsonAnswer<Loop>, Problem> {
+    conditions: Conditions,
+) -> Result<Tagged<Loop>, Problem> {
     let view = app.cell.loop_view(&LoopId::new(&name)?)?;
-    Ok(JsonAnswer(shaped(
-        &app,
-        view,
-        if query.state { Depth::State } else { Depth::Record },
-    )))
+    let tag = Tag::revision(view.spec.revision);
+    let depth = if query.state { Depth::State } else { Depth::Record };
+    Ok(Tagged::read(&conditions, tag, shaped(&app, view, depth)))
 }
 
 /// Creates or changes a loop. Answers when the change is in force on the actuator's side, or refused with nothing changed.
@@ -111,8 +118,9 @@ pub(crate) async fn show(
 pub(crate) async fn apply(
     State(app): State<App>,
     InPath(name): InPath<String>,
+    conditions: Conditions,
     Json(draft): Json<LoopDraft>,
-) -> Result<Response, Problem> {
+) -> Result<Tagged<Apply>, Problem> {
     LoopId::new(&name)?;
     if draft.name != name {
         let said: String = draft.name.chars().take(80).collect();
@@ -122,13 +130,13 @@ pub(crate) async fn apply(
             "use the same name in both",
         ));
     }
-    let end = finish(app.cell.apply(draft.into())).await?;
+    let end = finish(app.cell.apply(draft.into(), conditions.expect()?)).await?;
     let status = if end.created {
         StatusCode::CREATED
     } else {
         StatusCode::OK
     };
-    Ok((status, JsonAnswer(Apply::from(end))).into_response())
+    Ok(Tagged::changed(status, Tag::revision(end.revision), Apply::from(end)))
 }
 
 /// Ends a loop. Its outputs stay as they are.
@@ -136,8 +144,12 @@ pub(crate) async fn apply(
     responses(
         (status = 204, description = "Ended"),
         (status = "default", description = "What went wrong", body = Problem, content_type = "application/problem+json")))]
-pub(crate) async fn remove(State(app): State<App>, InPath(name): InPath<String>) -> Result<StatusCode, Problem> {
-    finish(app.cell.delete(LoopId::new(&name)?)).await?;
+pub(crate) async fn remove(
+    State(app): State<App>,
+    InPath(name): InPath<String>,
+    conditions: Conditions,
+) -> Result<StatusCode, Problem> {
+    finish(app.cell.delete(LoopId::new(&name)?, conditions.expect()?)).await?;
     Ok(StatusCode::NO_CONTENT)
 }
 
@@ -247,6 +259,11 @@ fn output_values(ports: &[&str], held: &[f64], asked: &BTreeMap<String, f64>) ->
         .collect()
 }
 
+/// The end of a change, with the tag of the revision that it brought.
+fn in_force(end: bumpless_deploy::ApplyEnd) -> Tagged<Apply> {
+    Tagged::changed(StatusCode::OK, Tag::revision(end.revision), Apply::from(end))
+}
+
 /// Sets parameters or the strategy of a running loop.
 #[utoipa::path(post, operation_id = "set_parameters", path = "/v1/loops/{name}/set", tag = "loops", params(("name" = String, Path)), request_body = SetRequest,
     responses(
@@ -255,15 +272,15 @@ fn output_values(ports: &[&str], held: &[f64], asked: &BTreeMap<String, f64>) ->
 pub(crate) async fn set(
     State(app): State<App>,
     InPath(name): InPath<String>,
+    conditions: Conditions,
     Json(request): Json<SetRequest>,
-) -> Result<JsonAnswer<Apply>, Problem> {
+) -> Result<Tagged<Apply>, Problem> {
     let change = Change {
         parameters: request.parameters,
         strategy: request.strategy.map(Into::into),
     };
-    Ok(JsonAnswer(
-        finish(app.cell.set(LoopId::new(&name)?, change)).await?.into(),
-    ))
+    let end = finish(app.cell.set(LoopId::new(&name)?, change, conditions.expect()?)).await?;
+    Ok(in_force(end))
 }
 
 /// Goes on with another component, without a bump.
@@ -275,13 +292,15 @@ pub(crate) async fn set(
 pub(crate) async fn swap(
     State(app): State<App>,
     InPath(name): InPath<String>,
+    conditions: Conditions,
     Json(request): Json<SwapRequest>,
-) -> Result<JsonAnswer<Apply>, Problem> {
-    Ok(JsonAnswer(
-        finish(app.cell.swap(LoopId::new(&name)?, request.component))
-            .await?
-            .into(),
-    ))
+) -> Result<Tagged<Apply>, Problem> {
+    let end = finish(
+        app.cell
+            .swap(LoopId::new(&name)?, request.component, conditions.expect()?),
+    )
+    .await?;
+    Ok(in_force(end))
 }
 
 /// Goes back to an earlier revision.
@@ -292,13 +311,15 @@ pub(crate) async fn swap(
 pub(crate) async fn rollback(
     State(app): State<App>,
     InPath(name): InPath<String>,
+    conditions: Conditions,
     Json(request): Json<RollbackRequest>,
-) -> Result<JsonAnswer<Apply>, Problem> {
-    Ok(JsonAnswer(
-        finish(app.cell.rollback(LoopId::new(&name)?, request.revision))
-            .await?
-            .into(),
-    ))
+) -> Result<Tagged<Apply>, Problem> {
+    let end = finish(
+        app.cell
+            .rollback(LoopId::new(&name)?, request.revision, conditions.expect()?),
+    )
+    .await?;
+    Ok(in_force(end))
 }
 
 /// Gives the ownership to another host, between two cycles.

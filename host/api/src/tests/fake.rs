@@ -10,8 +10,8 @@ use bumpless_core::{
     Migrated, Mode, Outcome, PointId, Policy, PortKind, PortSpec, Reading, Record, Strategy, desk::Tally,
 };
 use bumpless_deploy::{
-    ApplyEnd, Call, CallEnd, Change, CommandEnd, ComponentView, Counters, DrainEnd, DrainOrder, Error, HostView,
-    Imported, LoopDraft, LoopView, PointView, Relabel, Stage, StageView, Upload,
+    ApplyEnd, Call, CallEnd, Change, Check, CommandEnd, ComponentView, Counters, DrainEnd, DrainOrder, Error, Expect,
+    HealthView, HostView, Imported, LoopDraft, LoopView, PointView, Relabel, Stage, StageView, Upload,
 };
 use bumpless_deploy::{
     Window,
@@ -39,6 +39,10 @@ pub(crate) struct Fake {
     pub(crate) outcome: Mutex<Outcome>,
     pub(crate) commands: Mutex<Vec<(Option<CommandId>, CommandBody)>>,
     pub(crate) drafts: Mutex<Vec<LoopDraft>>,
+    /// What the changes of loops relied on.
+    pub(crate) expects: Mutex<Vec<Expect>>,
+    /// What does not hold of the host's health.
+    pub(crate) unwell: Mutex<Option<&'static str>>,
     pub(crate) uploads: Mutex<Vec<(Vec<u8>, Upload)>>,
     pub(crate) relabels: Mutex<Vec<Relabel>>,
     pub(crate) imports: Mutex<Vec<(Vec<u8>, String, bool)>>,
@@ -65,6 +69,8 @@ impl Fake {
             outcome: Mutex::new(Outcome::Done),
             commands: Mutex::default(),
             drafts: Mutex::default(),
+            expects: Mutex::default(),
+            unwell: Mutex::default(),
             uploads: Mutex::default(),
             relabels: Mutex::default(),
             imports: Mutex::default(),
@@ -361,8 +367,9 @@ impl Cell for Fake {
         self.answer(())
     }
 
-    fn apply(&self, draft: LoopDraft) -> Answer<ApplyEnd> {
+    fn apply(&self, draft: LoopDraft, expect: Expect) -> Answer<ApplyEnd> {
         self.drafts.lock().unwrap().push(draft);
+        self.expects.lock().unwrap().push(expect);
         self.answer(apply_end())
     }
 
@@ -389,19 +396,23 @@ impl Cell for Fake {
         })
     }
 
-    fn swap(&self, _: LoopId, _: String) -> Answer<ApplyEnd> {
+    fn swap(&self, _: LoopId, _: String, expect: Expect) -> Answer<ApplyEnd> {
+        self.expects.lock().unwrap().push(expect);
         self.answer(apply_end())
     }
 
-    fn set(&self, _: LoopId, _: Change) -> Answer<ApplyEnd> {
+    fn set(&self, _: LoopId, _: Change, expect: Expect) -> Answer<ApplyEnd> {
+        self.expects.lock().unwrap().push(expect);
         self.answer(apply_end())
     }
 
-    fn rollback(&self, _: LoopId, _: Option<u64>) -> Answer<ApplyEnd> {
+    fn rollback(&self, _: LoopId, _: Option<u64>, expect: Expect) -> Answer<ApplyEnd> {
+        self.expects.lock().unwrap().push(expect);
         self.answer(apply_end())
     }
 
-    fn delete(&self, _: LoopId) -> Answer<()> {
+    fn delete(&self, _: LoopId, expect: Expect) -> Answer<()> {
+        self.expects.lock().unwrap().push(expect);
         self.answer(())
     }
 
@@ -531,6 +542,16 @@ impl Cell for Fake {
             loops_held: 2,
             ready: true,
         })
+    }
+
+    fn health(&self, host: HostId) -> Answer<HealthView> {
+        let unwell = *self.unwell.lock().unwrap();
+        let checks = ["bus", "cell", "store", "service", "io"].map(|name| Check {
+            name: name.to_owned(),
+            good: unwell != Some(name),
+            text: if unwell == Some(name) { "it is not" } else { "it is" }.to_owned(),
+        });
+        self.answer(HealthView::new(host, 60_000, checks.to_vec()))
     }
 
     fn here(&self) -> HostId {

@@ -278,6 +278,9 @@ pub struct LoopAlarms {
     pub floods: Vec<AlarmFlood>,
     /// Hosts that did not answer.
     pub silent: Vec<SilentHost>,
+    /// Where the next part begins, where there are more: ask again with `after` set to it. The header `Link` has the address.
+    #[serde(default)]
+    pub next: Option<String>,
 }
 
 impl LoopAlarms {
@@ -302,6 +305,7 @@ impl LoopAlarms {
                     reason,
                 })
                 .collect(),
+            next: None,
         }
     }
 }
@@ -373,6 +377,9 @@ impl From<&AlarmEvent> for AlarmHappening {
 pub struct AlarmHistory {
     /// What happened.
     pub changes: Vec<AlarmHappening>,
+    /// Where the next part begins, where there are more: ask again with `after` set to it. The header `Link` has the address.
+    #[serde(default)]
+    pub next: Option<String>,
 }
 
 /// What a person does with an alarm.

@@ -13,6 +13,9 @@ use super::{Admission, ComponentEvent, ComponentHost, Direction, PortKind};
 pub struct Components {
     /// The components.
     pub components: Vec<Component>,
+    /// Where the next part begins, where there are more: ask again with `after` set to it. The header `Link` has the address.
+    #[serde(default)]
+    pub next: Option<String>,
 }
 
 /// One uploaded component and where it stands.

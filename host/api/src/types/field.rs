@@ -85,6 +85,9 @@ pub struct ByRequest {
 pub struct Buses {
     /// The buses.
     pub buses: Vec<Bus>,
+    /// Where the next part begins, where there are more: ask again with `after` set to it. The header `Link` has the address.
+    #[serde(default)]
+    pub next: Option<String>,
 }
 
 /// A bus as its host sees it. Counters count since the host's start.
@@ -421,6 +424,9 @@ impl JobState {
 pub struct Jobs {
     /// The jobs.
     pub jobs: Vec<Job>,
+    /// Where the next part begins, where there are more: ask again with `after` set to it. The header `Link` has the address.
+    #[serde(default)]
+    pub next: Option<String>,
 }
 
 /// A job.

@@ -16,8 +16,11 @@ pub struct Cycles {
     pub loop_name: String,
     /// The records, oldest first.
     pub records: Vec<Record>,
-    /// Are there more in the window? Ask again from the time of the last of these on.
+    /// Are there more in the window?
     pub more: bool,
+    /// Then: where they begin. Ask again with `after` set to it. The header `Link` has the address.
+    #[serde(default)]
+    pub next: Option<String>,
     /// Pieces of the log that were damaged and left out.
     pub unread: u64,
 }
@@ -284,6 +287,9 @@ pub struct Shadow {
 pub struct Shadows {
     /// Oldest first, without their points.
     pub shadows: Vec<Shadow>,
+    /// Where the next part begins, where there are more: ask again with `after` set to it. The header `Link` has the address.
+    #[serde(default)]
+    pub next: Option<String>,
 }
 
 /// What a window is where nothing is said.

@@ -1,6 +1,6 @@
 //! Hosts and points.
 
-use bumpless_deploy::{DrainEnd, HostView, PointView};
+use bumpless_deploy::{DrainEnd, HealthView, HostView, PointView};
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
@@ -11,6 +11,9 @@ use super::{Force, Quality, finite, ms};
 pub struct Hosts {
     /// The hosts.
     pub hosts: Vec<Host>,
+    /// Where the next part begins, where there are more: ask again with `after` set to it. The header `Link` has the address.
+    #[serde(default)]
+    pub next: Option<String>,
 }
 
 /// A host as the one that answers sees it.
@@ -75,6 +78,58 @@ impl From<HostView> for Host {
     }
 }
 
+/// The process answers.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct Alive {
+    /// The host.
+    pub host: String,
+    /// Always true: what is not alive does not answer.
+    pub alive: bool,
+}
+
+/// How well a host is.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct Health {
+    /// The host.
+    pub host: String,
+    /// May work be sent to it? All checks hold.
+    pub ready: bool,
+    /// For how long its process runs, in s.
+    pub up_s: f64,
+    /// Each thing that must hold.
+    pub checks: Vec<HealthCheck>,
+}
+
+/// One thing that must hold before work is sent to a host.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct HealthCheck {
+    /// `bus`, `cell`, `store`, `service` (it is not being emptied) or `io`.
+    pub name: String,
+    /// Does it hold?
+    pub good: bool,
+    /// How it stands, in words.
+    pub text: String,
+}
+
+impl From<HealthView> for Health {
+    fn from(view: HealthView) -> Self {
+        Self {
+            host: view.host.to_string(),
+            ready: view.ready,
+            up_s: view.up_ms as f64 / 1e3,
+            checks: view
+                .checks
+                .into_iter()
+                .map(|check| HealthCheck {
+                    name: check.name,
+                    good: check.good,
+                    text: check.text,
+                })
+                .collect(),
+        }
+    }
+}
+
 /// Empties a host.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields, default)]
@@ -124,6 +179,9 @@ fn rounded(value: f64) -> f64 {
 pub struct Points {
     /// The points.
     pub points: Vec<Point>,
+    /// Where the next part begins, where there are more: ask again with `after` set to it. The header `Link` has the address.
+    #[serde(default)]
+    pub next: Option<String>,
 }
 
 /// A point as its I/O host sees it.

@@ -214,7 +214,7 @@ impl From<LoopDraft> for deploy::LoopDraft {
 pub struct Loops {
     /// The loops, without their last records.
     pub loops: Vec<Loop>,
-    /// The last name of this answer, where there are more: ask again with `after` set to it.
+    /// Where the next part begins, where there are more: ask again with `after` set to it. The header `Link` has the address.
     pub next: Option<String>,
 }
 

@@ -174,6 +174,9 @@ pub struct Rollouts {
     pub rollouts: Vec<Rollout>,
     /// Hosts whose rollouts are not known.
     pub silent: Vec<SilentHost>,
+    /// Where the next part begins, where there are more: ask again with `after` set to it. The header `Link` has the address.
+    #[serde(default)]
+    pub next: Option<String>,
 }
 
 impl TryFrom<RolloutRequest> for RolloutDraft {
@@ -278,6 +281,7 @@ impl From<RolloutList> for Rollouts {
         Self {
             rollouts: list.rollouts.into_iter().map(Into::into).collect(),
             silent: list.silent.into_iter().map(silent).collect(),
+            next: None,
         }
     }
 }

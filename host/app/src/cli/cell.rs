@@ -7,6 +7,11 @@ use clap::Subcommand;
 pub(crate) enum HostsCommand {
     /// List them.
     List,
+    /// Say how well a host is: bus, disk, service, each with a word. Fails where it is not ready.
+    Health {
+        /// The host.
+        host: String,
+    },
     /// Empty a host: its loops move to others between two cycles, and new ones stay away. Returns when it owns none.
     Drain {
         /// The host.

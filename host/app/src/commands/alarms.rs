@@ -35,7 +35,7 @@ pub(crate) fn run(client: &Client, json: bool, what: AlarmCommand) -> Result<(),
             let of = loop_name
                 .map(|name| format!("&loop={}", encoded(&name)))
                 .unwrap_or_default();
-            let answer = client.get(&format!("/v1/alarms?all={all}{of}"))?;
+            let answer = client.list(&format!("/v1/alarms?all={all}{of}"), "alarms")?;
             if json {
                 return show::json(&answer.text);
             }

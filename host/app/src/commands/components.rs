@@ -122,7 +122,7 @@ fn list(client: &Client, json: bool, filter: &FilterArgs) -> Result<(), Error> {
             query.push_str(&format!("&{key}={}", encoded(value)));
         }
     }
-    let answer = client.get(&query)?;
+    let answer = client.list(&query, "components")?;
     if json {
         return show::json(&answer.text);
     }

@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use bumpless_api::types::{Drain, DrainRequest, Hosts, Points, Quality};
+use bumpless_api::types::{Drain, DrainRequest, Health, Hosts, Points, Quality};
 
 use crate::{
     cli::HostsCommand,
@@ -18,6 +18,7 @@ const ASK_AGAIN: Duration = Duration::from_millis(250);
 pub(crate) fn run(client: &Client, json: bool, what: HostsCommand) -> Result<(), Error> {
     match what {
         HostsCommand::List => list(client, json),
+        HostsCommand::Health { host } => health(client, json, &host),
         HostsCommand::Drain { host, keep } => {
             let path = format!("/v1/hosts/{}/drain", encoded(&host));
             let answer = client.post(&path, &DrainRequest { keep })?;
@@ -73,9 +74,29 @@ fn told(answer: &Answer, json: bool) -> Result<(), Error> {
     Ok(())
 }
 
+/// Says how well a host is.
+fn health(client: &Client, json: bool, host: &str) -> Result<(), Error> {
+    let answer = client.get(&format!("/v1/hosts/{}/health", encoded(host)))?;
+    let health: Health = answer.decode()?;
+    if json {
+        show::json(&answer.text)?;
+    } else {
+        let mut table = show::table(&["check", "", "how it stands"]);
+        for check in &health.checks {
+            let word = if check.good { "good" } else { "BAD" };
+            table.add_row([check.name.as_str(), word, check.text.as_str()]);
+        }
+        show::print(&table)?;
+    }
+    if health.ready {
+        return Ok(());
+    }
+    Err(Error::Unready(format!("host {} is not ready", health.host)))
+}
+
 /// Lists the hosts.
 fn list(client: &Client, json: bool) -> Result<(), Error> {
-    let answer = client.get("/v1/hosts")?;
+    let answer = client.list("/v1/hosts", "hosts")?;
     if json {
         return show::json(&answer.text);
     }
@@ -118,7 +139,7 @@ fn list(client: &Client, json: bool) -> Result<(), Error> {
 
 /// Lists the points.
 pub(crate) fn points(client: &Client, json: bool) -> Result<(), Error> {
-    let answer = client.get("/v1/points")?;
+    let answer = client.list("/v1/points", "points")?;
     if json {
         return show::json(&answer.text);
     }

@@ -140,7 +140,7 @@ fn watch(client: &Client, json: bool, points: &[String], every_ms: u64, looks: O
 }
 
 fn forced(client: &Client, json: bool) -> Result<(), Error> {
-    let mut points: Points = client.get("/v1/points")?.decode()?;
+    let mut points: Points = client.list("/v1/points?forced=true", "points")?.decode()?;
     points.points.retain(|point| point.force.is_some());
     if json {
         let text = serde_json::to_string(&points).map_err(|error| Error::Failed {
@@ -170,7 +170,7 @@ fn forced(client: &Client, json: bool) -> Result<(), Error> {
 }
 
 fn buses(client: &Client, json: bool) -> Result<(), Error> {
-    let answer = client.get("/v1/buses")?;
+    let answer = client.list("/v1/buses", "buses")?;
     if json {
         return show::json(&answer.text);
     }

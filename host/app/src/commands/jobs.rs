@@ -29,7 +29,7 @@ pub(crate) fn run(client: &Client, json: bool, what: JobCommand) -> Result<(), E
         JobCommand::Show { id } => one(json, &client.get(&path(&id, ""))?),
         JobCommand::Cancel { id, by } => one(json, &client.post(&path(&id, "/cancel"), &ByRequest { by: by.name() })?),
         JobCommand::List => {
-            let answer = client.get("/v1/jobs")?;
+            let answer = client.list("/v1/jobs", "jobs")?;
             if json {
                 return show::json(&answer.text);
             }

@@ -271,24 +271,11 @@ fn outputs(ports: &[&str], values: &[String]) -> Result<BTreeMap<String, f64>, E
 }
 
 fn list(client: &Client, json: bool) -> Result<(), Error> {
-    let mut loops = Vec::new();
-    let mut after = String::new();
-    loop {
-        let answer = client.get(&format!("/v1/loops?after={}", encoded(&after)))?;
-        let part: Loops = answer.decode()?;
-        loops.extend(part.loops);
-        match part.next {
-            Some(next) if next > after => after = next,
-            _ => break,
-        }
-    }
+    let answer = client.list("/v1/loops", "loops")?;
     if json {
-        let text = serde_json::to_string(&Loops { loops, next: None }).map_err(|error| Error::Answer {
-            api: client.api().to_owned(),
-            reason: error.to_string(),
-        })?;
-        return show::json(&text);
+        return show::json(&answer.text);
     }
+    let Loops { loops, .. } = answer.decode()?;
     let mut table = show::table(&[
         "loop",
         "component",

@@ -30,7 +30,7 @@ pub(crate) fn run(client: &Client, json: bool, what: RolloutCommand) -> Result<(
     match what {
         RolloutCommand::Start(args) => start(client, json, args),
         RolloutCommand::List => {
-            let answer = client.get("/v1/rollouts")?;
+            let answer = client.list("/v1/rollouts", "rollouts")?;
             if json {
                 return show::json(&answer.text);
             }

@@ -35,6 +35,9 @@ fn a_full_file_is_taken_as_it_stands() {
     let text = r#"
         host = "plant"
         data = "/var/lib/bumpless"
+        [otlp]
+        endpoint = "http://127.0.0.1:4318"
+        headers = { api-key = "k" }
         [cell]
         name = "demo"
         listen = ["tcp/10.0.0.1:7447"]
@@ -62,6 +65,8 @@ fn a_full_file_is_taken_as_it_stands() {
     assert_eq!(config.data, Path::new("/var/lib/bumpless"));
     assert_eq!((config.cell.lease_ms, config.cell.scouting), (300, true));
     assert_eq!((config.loops.workers, config.history_bytes_max), (3, None));
+    let otlp = config.otlp.expect("a collector");
+    assert!(otlp.metrics && otlp.traces && otlp.every_s == 15);
     assert!(matches!(config.engine.compile, bumpless_engine::Compile::InProcess));
     let BusConfig::Sim(sim) = &config.buses.buses[0] else {
         panic!("a simulated bus")
@@ -157,6 +162,10 @@ fn bad_files_say_where_and_what_helps() {
         (
             format!("{LEAST}[history]\nbytes = 15"),
             &["line 5, key bytes", "unknown field `bytes`", "`bytes_max_mib`"],
+        ),
+        (
+            format!("{LEAST}[otlp]\nendpoint = \"collector:4318\""),
+            &["key otlp", "http://HOST:PORT"],
         ),
         (format!("{LEAST}[[["), &["line 4"]),
     ];

@@ -235,7 +235,16 @@ mod tests {
         let text = "event: lost\ndata: {\"records\": 3}\n\n: keep-alive\n\nevent: new\ndata: x\n\n\
                     event: hosts\r\ndata: {\"hosts\":\r\ndata:  []}\r\n\r\n";
         let (news, reason) = news(text);
-        assert_eq!(news, [News::Lost(3), News::Hosts(Hosts { hosts: Vec::new() })]);
+        assert_eq!(
+            news,
+            [
+                News::Lost(3),
+                News::Hosts(Hosts {
+                    hosts: Vec::new(),
+                    next: None
+                })
+            ]
+        );
         assert_eq!(reason, "it ended");
     }
 

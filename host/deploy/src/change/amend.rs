@@ -9,6 +9,7 @@ use bumpless_core::{HostId, LoopId};
 use super::Dropped;
 use crate::{
     error::Error,
+    expect::Expect,
     plan,
     rollout::guarded::{self, Guarded},
     room::Room,
@@ -23,8 +24,10 @@ impl Room {
         from: HostId,
         id: LoopId,
         amend: Amend,
+        expect: Expect,
     ) -> Result<ApplyEnd, Error> {
         self.in_turn(id.clone(), move |room| async move {
+            room.expected(&id, &expect).await?;
             if matches!(amend, Amend::Roll(_) | Amend::Return { .. }) {
                 // These ask what is in force, and a loop that went back by itself has said so to the homes only.
                 room.settle_locked(&id).await?;

@@ -30,6 +30,7 @@ use super::{
 };
 use crate::{
     error::Error,
+    expect::Expect,
     limits::{ANSWER_WAIT, APPLY_WAIT, ROLLOUT_ASK_FOR, ROLLOUT_ASK_PAUSE, ROLLOUT_LOOK_EVERY, ROLLOUT_WATCH_SLACK},
     plan,
     room::{Room, every},
@@ -346,7 +347,14 @@ async fn amended(room: &Arc<Room>, id: &LoopId, amend: &Amend) -> Result<ApplyEn
     let until = Instant::now() + ROLLOUT_ASK_FOR;
     loop {
         let home = room.book.home(id)?;
-        match room.ask(&home, Ask::Amend(id.clone(), amend.clone()), APPLY_WAIT).await {
+        match room
+            .ask(
+                &home,
+                Ask::Amend(id.clone(), amend.clone(), Expect::Anything),
+                APPLY_WAIT,
+            )
+            .await
+        {
             Ok(Told::Applied(end)) => return Ok(end),
             Ok(_) => return Err(unexpected()),
             Err(error) if passing(&error) && Instant::now() < until => tokio::time::sleep(ROLLOUT_ASK_PAUSE).await,

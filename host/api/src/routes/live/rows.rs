@@ -265,6 +265,7 @@ impl Rows {
             }
             let hosts = Hosts {
                 hosts: self.app.cell.hosts().into_iter().map(Into::into).collect(),
+                next: None,
             };
             self.push("hosts", Event::default().json_data(hosts));
         }

@@ -1,0 +1,234 @@
+//! What the cell is asked for at each scrape: this host's counts, its hosts as it sees them, and the loops at home here.
+//!
+//! Never: a series without a bound; see [`METRIC_LOOPS_MAX`] and [`METRIC_HOSTS_MAX`].
+
+use std::{fmt, sync::Arc};
+
+use prometheus_client::{
+    collector::Collector,
+    encoding::{DescriptorEncoder, EncodeCounterValue, EncodeGaugeValue, EncodeMetric as _, NoLabelSet},
+    metrics::{MetricType, counter::ConstCounter, gauge::ConstGauge},
+    registry::Unit,
+};
+
+use crate::{
+    cell::Cell,
+    limits::{METRIC_HOSTS_MAX, METRIC_LOOPS_MAX},
+};
+
+/// Asks the cell at each scrape.
+pub(super) struct Scrape {
+    pub(super) cell: Arc<dyn Cell>,
+}
+
+impl fmt::Debug for Scrape {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Scrape").finish_non_exhaustive()
+    }
+}
+
+impl Collector for Scrape {
+    fn encode(&self, mut encoder: DescriptorEncoder<'_>) -> fmt::Result {
+        let c = self.cell.counters();
+        for (name, help, value) in [
+            ("records", "Records that reached this host", c.records),
+            ("cycles_taken", "Cycles taken, loops whose home is here", c.cycles_taken),
+            (
+                "cycles_lost",
+                "Cycles without a commit, loops whose home is here",
+                c.cycles_lost,
+            ),
+            (
+                "cycles_skipped",
+                "Cycles that the home came too late for",
+                c.cycles_skipped,
+            ),
+            ("takeovers", "Changes of ownership after a silence", c.takeovers),
+            ("commits_refused", "Commits that the arbiter refused", c.commits_refused),
+            ("uploads", "Components taken in", c.uploads),
+            ("uploads_refused", "Components refused", c.uploads_refused),
+            ("applies", "Changes of loops that ended well, homes here", c.applies),
+            (
+                "applies_refused",
+                "Changes of loops that were refused, homes here",
+                c.applies_refused,
+            ),
+            ("fetches", "Components fetched from other hosts", c.fetches),
+            ("fetches_failed", "Fetches that failed", c.fetches_failed),
+            (
+                "fetches_corrupt",
+                "Fetched bytes whose digest was wrong",
+                c.fetches_corrupt,
+            ),
+            (
+                "prepares_failed",
+                "Revisions that could not be made ready here",
+                c.prepares_failed,
+            ),
+            ("requests", "Requests from other hosts that were answered", c.requests),
+            (
+                "malformed",
+                "Messages from other hosts that could not be read",
+                c.malformed,
+            ),
+            (
+                "arrivals_dropped",
+                "Messages dropped because a queue was full",
+                c.arrivals_dropped,
+            ),
+            (
+                "cycles_recorded",
+                "Cycles in the log on disk, loops whose home is here",
+                c.cycles_recorded,
+            ),
+            (
+                "cycles_unrecorded",
+                "Cycles that the log dropped because too many waited for the disk",
+                c.cycles_unrecorded,
+            ),
+            (
+                "cycle_log_damaged",
+                "Pieces of the log that could not be read",
+                c.cycle_log_damaged,
+            ),
+        ] {
+            let metric = ConstCounter::new(value);
+            metric.encode(encoder.encode_descriptor(name, help, None, metric.metric_type())?)?;
+        }
+        for (name, help, value) in [
+            ("hosts_alive", "Hosts that are alive", c.hosts_alive),
+            ("loops_known", "Loops known to this host", c.loops_known),
+            ("loops_home", "Loops whose home is here", c.loops_home),
+            ("loops_held", "Loops held here, owned or standing by", c.loops_held),
+            ("loops_owned", "Loops owned here", c.loops_owned),
+            ("components", "Components in the library", c.components),
+        ] {
+            let metric = ConstGauge::new(value);
+            metric.encode(encoder.encode_descriptor(name, help, None, metric.metric_type())?)?;
+        }
+        let metric = ConstGauge::new(c.cycle_log_bytes);
+        let help = "Recorded cycles on disk";
+        metric.encode(encoder.encode_descriptor("cycle_log", help, Some(&Unit::Bytes), metric.metric_type())?)?;
+        self.hosts(&mut encoder)?;
+        self.loops(&mut encoder)
+    }
+}
+
+/// One labelled value per row.
+fn gauges<V: EncodeGaugeValue>(
+    encoder: &mut DescriptorEncoder<'_>,
+    (name, help, unit): (&str, &str, Option<&Unit>),
+    label: &str,
+    rows: &[(String, V)],
+) -> fmt::Result {
+    let mut metric = encoder.encode_descriptor(name, help, unit, MetricType::Gauge)?;
+    for (value_of, value) in rows {
+        metric
+            .encode_family(&[(label, value_of.as_str())])?
+            .encode_gauge(value)?;
+    }
+    Ok(())
+}
+
+/// One labelled count per row.
+fn counters<V: EncodeCounterValue>(
+    encoder: &mut DescriptorEncoder<'_>,
+    (name, help): (&str, &str),
+    label: &str,
+    rows: &[(String, V)],
+) -> fmt::Result {
+    let mut metric = encoder.encode_descriptor(name, help, None, MetricType::Counter)?;
+    for (value_of, value) in rows {
+        metric
+            .encode_family(&[(label, value_of.as_str())])?
+            .encode_counter::<NoLabelSet, V, f64>(value, None)?;
+    }
+    Ok(())
+}
+
+impl Scrape {
+    fn hosts(&self, encoder: &mut DescriptorEncoder<'_>) -> fmt::Result {
+        let hosts: Vec<_> = self.cell.hosts().into_iter().take(METRIC_HOSTS_MAX).collect();
+        let rows = |value: &dyn Fn(&bumpless_deploy::HostView) -> f64| -> Vec<(String, f64)> {
+            hosts.iter().map(|h| (h.id.to_string(), value(h))).collect()
+        };
+        let alive = rows(&|h| f64::from(u8::from(h.alive)));
+        gauges(
+            encoder,
+            ("host_alive", "1 while the host is alive, as this host sees it", None),
+            "host",
+            &alive,
+        )?;
+        let cpu = rows(&|h| f64::from(h.cpu));
+        gauges(
+            encoder,
+            (
+                "host_cpu",
+                "Load of the cores that the host may use, 0 to 1",
+                Some(&Unit::Other("ratio".to_owned())),
+            ),
+            "host",
+            &cpu,
+        )?;
+        let memory = rows(&|h| h.memory_bytes as f64);
+        gauges(
+            encoder,
+            ("host_memory", "Resident memory of the host", Some(&Unit::Bytes)),
+            "host",
+            &memory,
+        )?;
+        let latency: Vec<(String, f64)> = hosts
+            .iter()
+            .filter_map(|h| h.latency_ns.map(|ns| (h.id.to_string(), ns as f64 * 1e-9)))
+            .collect();
+        let help = "Smoothed latency of a step on the host, as this host measures it";
+        gauges(encoder, ("host_latency", help, Some(&Unit::Seconds)), "host", &latency)
+    }
+
+    /// Loops whose home is here: only the home counts their cycles.
+    fn loops(&self, encoder: &mut DescriptorEncoder<'_>) -> fmt::Result {
+        let loops = self.cell.loops();
+        let home = || {
+            loops
+                .iter()
+                .filter_map(|l| l.tally.map(|t| (l, t)))
+                .take(METRIC_LOOPS_MAX)
+        };
+        for (name, help, value) in [
+            (
+                "loop_cycles_taken",
+                "Cycles taken",
+                (|t| t.taken) as fn(bumpless_core::desk::Tally) -> u64,
+            ),
+            ("loop_cycles_lost", "Cycles that ended without a commit", |t| t.lost),
+            ("loop_takeovers", "Changes of ownership after a silence", |t| {
+                t.takeovers
+            }),
+        ] {
+            let rows: Vec<(String, u64)> = home().map(|(l, t)| (l.id.to_string(), value(t))).collect();
+            counters(encoder, (name, help), "loop", &rows)?;
+        }
+        let age: Vec<(String, f64)> = home()
+            .filter_map(|(l, _)| l.last_age_ms.map(|ms| (l.id.to_string(), ms as f64 * 1e-3)))
+            .collect();
+        gauges(
+            encoder,
+            ("loop_record_age", "Age of the last record", Some(&Unit::Seconds)),
+            "loop",
+            &age,
+        )?;
+        let setpoint: Vec<(String, f64)> = home()
+            .filter_map(|(l, _)| l.last.as_ref().map(|r| (l.id.to_string(), r.setpoint)))
+            .collect();
+        gauges(
+            encoder,
+            (
+                "loop_setpoint",
+                "Setpoint in force, in the unit of the measurement",
+                None,
+            ),
+            "loop",
+            &setpoint,
+        )
+    }
+}

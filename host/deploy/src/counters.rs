@@ -1,0 +1,54 @@
+//! What a host counts, gathered for monitoring.
+//!
+//! Never: counts; whoever does something counts it.
+
+use std::{
+    sync::atomic::{AtomicU64, Ordering},
+    time::Instant,
+};
+
+use crate::{room::Room, view::Counters};
+
+impl Room {
+    /// What this host counts.
+    pub(crate) fn counters(&self) -> Counters {
+        let now = Instant::now();
+        let get = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
+        let log = self.cycles.as_ref().map(|cycles| cycles.counts()).unwrap_or_default();
+        let mut counters = Counters {
+            hosts_alive: self.roster.all().iter().filter(|(_, seen)| seen.alive(now)).count() as u64,
+            loops_known: self.book.len() as u64,
+            loops_held: self.holder.len() as u64,
+            loops_owned: u64::from(self.field.owned()),
+            components: self.library.len() as u64,
+            records: self.feed.count(),
+            uploads: get(&self.tallies.uploads),
+            uploads_refused: get(&self.tallies.uploads_refused),
+            applies: get(&self.tallies.applies),
+            applies_refused: get(&self.tallies.applies_refused),
+            fetches: get(&self.tallies.fetches),
+            fetches_failed: get(&self.tallies.fetches_failed),
+            fetches_corrupt: get(&self.tallies.fetches_corrupt),
+            prepares_failed: get(&self.tallies.prepares_failed),
+            requests: get(&self.tallies.requests),
+            malformed: get(&self.tallies.malformed),
+            arrivals_dropped: get(&self.tallies.arrivals_dropped),
+            cycles_recorded: log.written,
+            cycles_unrecorded: log.dropped,
+            cycle_log_damaged: log.damaged,
+            cycle_log_bytes: log.bytes,
+            ..Counters::default()
+        };
+        for intent in self.book.all().iter().filter(|intent| intent.home == self.here) {
+            counters.loops_home += 1;
+            if let Some(view) = self.field.home_view(&intent.loop_id) {
+                counters.cycles_taken += view.tally.taken;
+                counters.cycles_lost += view.tally.lost;
+                counters.cycles_skipped += view.tally.skipped;
+                counters.takeovers += view.tally.takeovers;
+                counters.commits_refused += view.tally.refused;
+            }
+        }
+        counters
+    }
+}
