@@ -138,7 +138,12 @@ fn a_client_that_was_made_from_the_document_drives_a_cell() {
     let (_cell, api) = one_host();
     let folder = tempfile::tempdir().unwrap();
     let config = folder.path().join("config.yml");
-    fs::write(&config, "post_hooks: []\npackage_name_override: bumpless_client\n").unwrap();
+    // It knows no types of bytes but its own, and says so; the operations with JSON are what is looked at.
+    let words = "\
+        post_hooks: []\npackage_name_override: bumpless_client\ncontent_type_overrides:\n  \
+        application/wasm: application/octet-stream\n  application/x-tar: application/octet-stream\n  \
+        application/openmetrics-text: text/plain\n";
+    fs::write(&config, words).unwrap();
     run(Command::new(&python)
         .current_dir(folder.path())
         .args([

@@ -33,7 +33,7 @@ use crate::{
         field::start, field::jobs, field::job, field::cancel,
         health::livez, health::readyz, pages::metrics, pages::openapi,
     ),
-    components(schemas(Problem, types::Record, types::Hosts, types::LiveRows, types::Standing, types::FieldNews)),
+    components(schemas(Problem, types::Record, types::Hosts, types::LiveRows, types::Standing, types::FieldNews, live::Form)),
     tags(
         (name = "components", description = "The library of control components"),
         (name = "loops", description = "Controllers bound to points"),
@@ -137,6 +137,27 @@ mod tests {
                 assert!(has("413") && has("415"), "{place}");
             }
         }
+    }
+
+    #[test]
+    fn every_reference_leads_somewhere() {
+        fn references(value: &serde_json::Value, found: &mut Vec<String>) {
+            match value {
+                serde_json::Value::Object(map) => {
+                    found.extend(map.get("$ref").and_then(|to| to.as_str()).map(str::to_owned));
+                    map.values().for_each(|value| references(value, found));
+                }
+                serde_json::Value::Array(rows) => rows.iter().for_each(|row| references(row, found)),
+                _ => {}
+            }
+        }
+        let document: serde_json::Value = serde_json::from_str(openapi_json()).expect("it is JSON");
+        let mut found = Vec::new();
+        references(&document, &mut found);
+        assert!(found.len() > 100, "{}", found.len());
+        let lost = |to: &String| document.pointer(to.trim_start_matches('#')).is_none();
+        let lost: Vec<String> = found.into_iter().filter(lost).collect();
+        assert!(lost.is_empty(), "{lost:?}");
     }
 
     /// The shape of an answer: its keys, and of a list the shape of its first row.

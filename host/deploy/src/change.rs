@@ -289,8 +289,10 @@ impl Room {
         if members.is_empty() {
             return Err(nobody());
         }
-        let tried = self.ask_members(&members, &Ask::Try(Box::new(spec.clone())));
-        let tried = tried.instrument(info_span!(target: SPANS, "try")).await;
+        let tried = self
+            .ask_members(&members, &Ask::Try(Box::new(spec.clone())))
+            .instrument(info_span!(target: SPANS, "try"))
+            .await;
         if tried.ready.is_empty() {
             return Err(tried.failure(&format!("no host can run loop {id}"), "nothing was created"));
         }

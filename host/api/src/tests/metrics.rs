@@ -113,7 +113,7 @@ async fn metrics_are_open_metrics_with_units_and_labels() {
 async fn times_are_observed_from_the_cycles_that_this_host_owned() {
     let cell = Arc::new(Fake::new());
     let (stop, stopped) = watch::channel(false);
-    let metrics = Arc::new(crate::metrics::Metrics::new(Arc::clone(&cell) as _));
+    let metrics = Arc::new(Metrics::new(Arc::clone(&cell) as _));
     let follower = tokio::spawn(Arc::clone(&metrics).follow(Arc::clone(&cell) as _, stopped));
     while cell.readers() == 0 {
         tokio::task::yield_now().await;
