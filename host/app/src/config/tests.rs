@@ -77,7 +77,7 @@ fn a_full_file_is_taken_as_it_stands() {
 #[test]
 fn bad_files_say_where_and_what_helps() {
     let bus = "[[bus]]\nid = \"plant\"\ndriver = \"sim\"\n";
-    let table: [(String, &[&str]); 23] = [
+    let table: [(String, &[&str]); 24] = [
         (
             format!("{LEAST}[testing]\nflip_bits_every = 5"),
             &["key testing", "cell demo may be a real one", "begins with \"test\""],
