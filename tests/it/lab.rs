@@ -2,7 +2,7 @@
 
 use std::{fs, path::Path};
 
-use bumpless_core::indices::{Indices, Rule, TotalVariation};
+use bumpless_core::indices::{Indices, Rule, StepResponse, TotalVariation};
 use bumpless_tests::{Api, Binary, Cell, CellOptions, components, first_order_loop};
 use serde_json::{Value, json};
 
@@ -50,9 +50,77 @@ fn lab_figures(folder: &Path, experiment: &str) -> Value {
     all["variants"][0]["loops"][LOOP].clone()
 }
 
+/// Recorded cycles of a loop, oldest first.
+fn recorded(api: &Api, name: &str) -> Vec<Value> {
+    let answer = api.get(&format!("/v1/loops/{name}/cycles?last=1000")).unwrap();
+    answer["records"].as_array().unwrap().clone()
+}
+
+/// Holds the figures of recorded cycles, from the first under the setpoint `up` to the last, against those of the lab.
+#[track_caller]
+fn agree(records: &[Value], up: f64, band_percent: f64, lab: &Value) {
+    let first = records.iter().position(|r| number(&r["setpoint"]) == up).unwrap();
+    let t_s = |r: &Value| r["at_unix_us"].as_u64().unwrap() as f64 * 1e-6;
+    let start_s = t_s(&records[first]);
+    let (mut indices, mut travel) = (Indices::new(Rule::Rectangle), TotalVariation::default());
+    travel.add(number(&records[first - 1]["outputs"]["out"]));
+    let (mut before, mut step) = (number(&records[first - 1]["setpoint"]), None::<StepResponse>);
+    let (mut overshoot, mut settlings) = (0.0_f64, Vec::new());
+    for r in &records[first..] {
+        let (t, setpoint, measurement) = (t_s(r) - start_s, number(&r["setpoint"]), number(&r["measurement"]));
+        indices.add(t, setpoint, measurement).unwrap();
+        travel.add(number(&r["outputs"]["out"]));
+        if setpoint != before {
+            let ended = step.replace(StepResponse::new(t, before, setpoint, band_percent).unwrap());
+            overshoot = ended
+                .iter()
+                .map(StepResponse::overshoot_percent)
+                .fold(overshoot, f64::max);
+            settlings.extend(ended.and_then(|s| s.settling_time_s()));
+            before = setpoint;
+        }
+        step.as_mut().unwrap().add(t, measurement).unwrap();
+    }
+    let last = step.unwrap();
+    overshoot = overshoot.max(last.overshoot_percent());
+    settlings.extend(last.settling_time_s());
+    let settling = settlings.iter().sum::<f64>() / settlings.len() as f64;
+    let of = |key: &str| number(&lab[key]["mean"]);
+    for (key, live) in [
+        ("iae", indices.iae()),
+        ("ise", indices.ise()),
+        ("itae", indices.itae()),
+        ("itse", indices.itse()),
+        ("id", indices.id_percent().unwrap()),
+        ("tv", travel.value()),
+    ] {
+        assert!(
+            (live / of(key) - 1.0).abs() < 0.01,
+            "{key}: {live} live, {} in the lab",
+            of(key)
+        );
+    }
+    // In % of the step, and to a cycle: more a sampled response does not say.
+    assert!(
+        (overshoot - of("overshoot")).abs() < 0.5,
+        "overshoot: {overshoot} live, {} in the lab",
+        of("overshoot")
+    );
+    let period_s = PERIOD_MS * 1e-3;
+    assert!(
+        (settling - of("settling")).abs() < period_s * 1.01 + 0.01 * settling,
+        "settling: {settling} live, {} in the lab",
+        of("settling")
+    );
+}
+
 fn cycles_pass(api: &Api, count: u64) {
-    let seen = api.loop_view(LOOP).unwrap()["seq"].as_u64().unwrap();
-    api.wait_for_loop(LOOP, "further cycles", |view| {
+    cycles_pass_of(api, LOOP, count);
+}
+
+fn cycles_pass_of(api: &Api, name: &str, count: u64) {
+    let seen = api.loop_view(name).unwrap()["seq"].as_u64().unwrap();
+    api.wait_for_loop(name, "further cycles", |view| {
         view["seq"].as_u64() >= Some(seen + count)
     })
     .unwrap();
@@ -77,19 +145,9 @@ fn a_live_loop_has_the_figures_of_the_lab_and_takes_its_winner_as_a_shadow() {
     cycles_pass(&api, 40);
 
     // What was recorded, from the first cycle under the new setpoint on.
-    let recorded = api.get(&format!("/v1/loops/{LOOP}/cycles?last=1000")).unwrap();
-    let records = recorded["records"].as_array().unwrap();
+    let records = recorded(&api, LOOP);
     let first = |setpoint: f64| records.iter().position(|r| number(&r["setpoint"]) == setpoint).unwrap();
     let (up, down) = (first(40.0), first(30.0));
-    let t_s = |r: &Value| r["at_unix_us"].as_u64().unwrap() as f64 * 1e-6;
-    let (mut indices, mut travel) = (Indices::new(Rule::Rectangle), TotalVariation::default());
-    travel.add(number(&records[up - 1]["outputs"]["out"]));
-    for r in &records[up..] {
-        indices
-            .add(t_s(r), number(&r["setpoint"]), number(&r["measurement"]))
-            .unwrap();
-        travel.add(number(&r["outputs"]["out"]));
-    }
 
     // The same in virtual time.
     let period_s = PERIOD_MS * 1e-3;
@@ -112,18 +170,7 @@ setpoint = [{{ at_s = 0, to = 20 }}, {{ at_s = {up_s}, to = 40 }}, {{ at_s = {do
         end = up_s + seconds,
     );
     let lab = lab_figures(folder.path(), &experiment);
-    for (key, live) in [
-        ("iae", indices.iae()),
-        ("ise", indices.ise()),
-        ("itae", indices.itae()),
-        ("tv", travel.value()),
-    ] {
-        let virtual_time = number(&lab[key]["mean"]);
-        assert!(
-            (live / virtual_time - 1.0).abs() < 0.01,
-            "{key}: {live} live, {virtual_time} in the lab"
-        );
-    }
+    agree(&records, 40.0, 5.0, &lab);
 
     // From the plant to the lab: the window as a file, and the process behind it.
     let window = folder.path().join("window.json");
@@ -168,6 +215,124 @@ setpoint = [{{ at_s = 0, to = 20 }}, {{ at_s = {up_s}, to = 40 }}, {{ at_s = {do
     assert!(text(&shadow["report"]["component"]).starts_with("pidplus@"), "{shadow}");
     assert_eq!(shadow["complete"], true, "{shadow}");
     assert_eq!(number(&shadow["report"]["parameters"]["ti"]), 1.2);
+}
+
+#[test]
+fn a_live_pilot_plant_has_the_figures_of_the_lab() {
+    let pilot = "{ noise = 0.0, adc_bits = 16 }";
+    let bus = format!("[[bus]]\nid = \"plant\"\ndriver = \"sim\"\nseed = 7\nplant = {pilot}\n");
+    let mut cell = Cell::start(
+        CellOptions {
+            bus,
+            ..CellOptions::default()
+        }
+        .controllers(2),
+    )
+    .unwrap();
+    let api = cell.api().unwrap();
+    api.upload_stock(&["pid"]).unwrap();
+    api.apply(&json!({
+        "name": "vessel",
+        "component": "pid",
+        "period_ms": PERIOD_MS,
+        "ports": { "pv": "plant.pit129", "out": "plant.p1" },
+        "parameters": { "k": 2.0, "ti": 4.5, "out-high": 10.0 },
+        "setpoint": 0.4,
+        "strategy": "round-robin",
+    }))
+    .unwrap();
+    api.wait_for_loop("vessel", "a first cycle", |view| view["seq"].is_number())
+        .unwrap();
+    cycles_pass_of(&api, "vessel", 40);
+    api.setpoint("vessel", 0.7).unwrap();
+    cycles_pass_of(&api, "vessel", 90);
+    let records = recorded(&api, "vessel");
+    let up = records.iter().position(|r| number(&r["setpoint"]) == 0.7).unwrap();
+    // The plant stands until the first output, so both begin with the first cycle: the lab's is one period after its start.
+    let period_s = PERIOD_MS * 1e-3;
+    let up_s = (up + 1) as f64 * period_s;
+    let folder = tempfile::tempdir().unwrap();
+    let experiment = format!(
+        r#"
+name = "pilot"
+duration_s = {end}
+plant = {{ model = "pilot", pilot = {pilot} }}
+controller = {{ component = "pid", parameters = {{ k = 2.0, ti = 4.5, out-high = 10.0 }} }}
+measure = {{ from_s = {up_s}, of = "measured" }}
+[[loop]]
+name = "{LOOP}"
+ports = {{ pv = "pit129", out = "p1" }}
+period_ms = {PERIOD_MS}
+setpoint = [{{ at_s = 0, to = 0.4 }}, {{ at_s = {up_s}, to = 0.7 }}]
+"#,
+        end = up_s + (records.len() - 1 - up) as f64 * period_s,
+    );
+    agree(&records, 0.7, 5.0, &lab_figures(folder.path(), &experiment));
+}
+
+#[test]
+fn two_processes_write_the_same_bytes_and_a_report_can_be_written_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("twice.toml");
+    let text = r#"
+name = "twice"
+duration_s = 60
+seeds = 3
+plant = { model = "component:fopdt", constants = { gain = 1.0, tau = 2.0, dead-time = 0.6, noise = 0.1 } }
+controller = { component = "pid", parameters = { k = 0.6, ti = 2.2 } }
+[[loop]]
+name = "l"
+ports = { pv = "pv", out = "out" }
+period_ms = 500
+strategy = "random"
+setpoint = [{ at_s = 0, to = 20 }, { at_s = 10, to = 40 }]
+[network]
+reads = { loss = { kind = "random", probability = 0.2 } }
+[cell]
+link = { delay = { kind = "uniform", least_ms = 0.1, most_ms = 5.0 } }
+[[cell.host]]
+name = "a"
+[[cell.host]]
+name = "b"
+[[case]]
+name = "pid"
+[[case]]
+name = "pidplus"
+set = { "controller.component" = "pidplus" }
+"#;
+    fs::write(&file, text).unwrap();
+    let stock = components().unwrap();
+    let lab = |what: &str, out: &Path, more: &[&str]| {
+        let mut words = vec!["lab", what, file.to_str().unwrap(), "--out", out.to_str().unwrap()];
+        words.extend(["--components", stock.to_str().unwrap()]);
+        words.extend(more);
+        bumpless(None, &words)
+    };
+    let names = ["twice.html", "twice.csv", "twice-curves.csv", "twice.json"];
+    let files = |out: &Path| names.map(|name| fs::read(out.join(name)).unwrap());
+    let (one, other) = (folder.path().join("one"), folder.path().join("other"));
+    // Processes of their own, one run after another and two at a time.
+    lab("run", &one, &["--jobs", "1"]);
+    lab("run", &other, &["--jobs", "2", "--fresh"]);
+    let first = files(&one);
+    assert!(first == files(&other), "the same file and seeds give the same bytes");
+    assert!(first.iter().all(|bytes| bytes.len() > 500));
+    // Written again from what was kept: the same bytes, and nothing was made anew.
+    let kept = || {
+        let mut kept: Vec<_> = fs::read_dir(one.join("kept"))
+            .unwrap()
+            .map(|entry| entry.unwrap())
+            .map(|entry| (entry.file_name(), entry.metadata().unwrap().modified().unwrap()))
+            .collect();
+        kept.sort();
+        kept
+    };
+    let before = kept();
+    assert_eq!(before.len(), 6);
+    fs::remove_file(one.join("twice.html")).unwrap();
+    let said = lab("report", &one, &[]);
+    assert!(said.contains("report: "), "{said}");
+    assert!(first == files(&one) && before == kept());
 }
 
 #[test]

@@ -19,18 +19,21 @@ use bumpless_sdk::{
 use bumpless_smith::Smith;
 use serde_json::{Value, json};
 
-use crate::plant::{Draw, Plant};
+use crate::{
+    plant::{Draw, Plant},
+    stations,
+};
 
-type Given = Vec<(&'static str, f64)>;
+pub(crate) type Given = Vec<(&'static str, f64)>;
 
 /// Where every loop begins: output and setpoint of a process at rest.
-const BASE: f64 = 40.0;
+pub(crate) const BASE: f64 = 40.0;
 
 /// All cases.
 pub(crate) fn all() -> Vec<Value> {
     let mut draw = Draw(20_260);
     let mut cases = Vec::new();
-    for n in 0..10 {
+    for n in 0..16 {
         cases.push(pid(&mut draw, n));
     }
     for n in 0..3 {
@@ -45,10 +48,11 @@ pub(crate) fn all() -> Vec<Value> {
         cases.push(mpc(&mut draw, n));
         cases.push(fuzzy(&mut draw, n));
     }
+    cases.extend(stations::all(&mut draw));
     cases
 }
 
-fn parameters(given: &Given) -> Value {
+pub(crate) fn parameters(given: &Given) -> Value {
     given
         .iter()
         .map(|(name, value)| ((*name).to_owned(), json!(value)))
@@ -56,26 +60,46 @@ fn parameters(given: &Given) -> Value {
         .into()
 }
 
-/// A closed loop: a step of the setpoint after 1 s, a load at the process's input at half time.
+/// A course without a pattern: at rest for a second, then steps and ramps within `reach`, three to six of them.
+fn profile(draw: &mut Draw, reach: f64, dt_s: f64, cycles: usize) -> Vec<f64> {
+    let mut course = vec![0.0; (1.0 / dt_s).round() as usize];
+    let moves = draw.between(3.0, 6.99) as usize;
+    let mut value: f64 = 0.0;
+    while course.len() < cycles {
+        let length = (cycles as f64 / moves as f64 * draw.between(0.6, 1.4)) as usize;
+        let to = draw.between(-reach, reach);
+        // One of three goes there slowly.
+        let ramp = if draw.between(0.0, 3.0) < 1.0 { length / 2 } else { 0 };
+        let from = value;
+        course.extend((1..=ramp).map(|i| from + (to - from) * i as f64 / ramp as f64));
+        course.extend(std::iter::repeat_n(to, length - ramp));
+        value = to;
+    }
+    course.truncate(cycles);
+    course
+}
+
+/// Greatest setpoint and load of a profile, in units of measurement and output.
+const REACH: (f64, f64) = (10.0, 6.0);
+
+/// A closed loop under a course of the setpoint, and one of a load at the process's input.
 fn closed<C: Controller>(
     given: &Given,
     plant: &mut Plant,
     dt_s: f64,
-    cycles: u32,
-    (step, load): (f64, f64),
+    (setpoint, load): (&[f64], &[f64]),
 ) -> [Vec<f64>; 2] {
     let mut bench = Bench::<C>::start(given, &[BASE]).unwrap();
     let pv = Input::of(C::DESCRIPTION.ports, "pv");
     let rest = plant.output();
     let (mut ys, mut us) = (Vec::new(), Vec::new());
-    for i in 0..cycles {
-        let t = f64::from(i) * dt_s;
-        bench.set_setpoint(if t >= 1.0 - 1e-9 { rest + step } else { rest });
+    for (setpoint, load) in setpoint.iter().zip(load) {
+        bench.set_setpoint(rest + setpoint);
         bench.set(pv, plant.output());
         let u = bench.step(dt_s).unwrap()[0];
         ys.push(plant.output());
         us.push(u);
-        plant.advance(if i >= cycles / 2 { u + load } else { u });
+        plant.advance(u + load);
     }
     [ys, us]
 }
@@ -106,21 +130,28 @@ fn pid(draw: &mut Draw, n: u32) -> Value {
     let delay_s = draw.on_grid(0.0, 3.0, dt_s);
     let mut plant = Plant::resting(draw.between(0.5, 3.0), [t1, t2], delay_s, dt_s, BASE);
     let mut given = simc(&plant, draw);
-    given.push(("n", draw.between(5.0, 20.0)));
-    // The first ones as simple-pid has them: all of the setpoint in P, none in D.
-    let (beta, gamma) = if n < 5 {
-        (1.0, 0.0)
+    // Three of four as simple-pid can have them: all or nothing of the setpoint in P and in D. Its D has no filter, so where D
+    // sees the setpoint step ours has hardly one.
+    let (beta, gamma, filter) = if n % 4 == 3 {
+        (draw.between(0.0, 1.0), draw.between(0.0, 1.0), draw.between(5.0, 20.0))
     } else {
-        (draw.between(0.0, 1.0), draw.between(0.0, 1.0))
+        let gamma = f64::from(u8::from(n % 3 == 1));
+        let filter = if gamma > 0.0 { 100.0 } else { draw.between(5.0, 20.0) };
+        (f64::from(u8::from(n % 5 > 1)), gamma, filter)
     };
+    given.push(("n", filter));
     given.push(("beta", beta));
     given.push(("gamma", gamma));
     let run = if n % 3 == 2 { closed::<PidPlus> } else { closed::<Pid> };
-    let [y, u] = run(&given, &mut plant, dt_s, cycles, (10.0, 5.0));
+    let (setpoint, load) = (
+        profile(draw, REACH.0, dt_s, cycles),
+        profile(draw, REACH.1, dt_s, cycles),
+    );
+    let [y, u] = run(&given, &mut plant, dt_s, (&setpoint, &load));
     json!({
         "law": "pid", "name": format!("pid {n}"), "parameters": parameters(&given), "dt": dt_s, "base": BASE,
-        "plant": {"gain": plant.gain, "lags": plant.lags_s, "delay": delay_s}, "step": 10.0, "load": 5.0,
-        "y": y, "u": u,
+        "plant": {"gain": plant.gain, "lags": plant.lags_s, "delay": delay_s}, "step": REACH.0, "setpoint": setpoint,
+        "load": load, "y": y, "u": u,
     })
 }
 
@@ -138,9 +169,11 @@ fn smith(draw: &mut Draw, n: u32) -> Value {
         ("model-lag", lag),
         ("model-delay", delay_s),
     ];
-    let [y, _] = closed::<Smith>(&given, &mut plant, dt_s, cycles, (10.0, 0.0));
+    let setpoint = profile(draw, REACH.0, dt_s, cycles);
+    let [y, _] = closed::<Smith>(&given, &mut plant, dt_s, (&setpoint, &vec![0.0; cycles]));
     json!({
-        "law": "smith", "name": format!("smith {n}"), "parameters": parameters(&given), "dt": dt_s, "base": BASE, "step": 10.0, "y": y,
+        "law": "smith", "name": format!("smith {n}"), "parameters": parameters(&given), "dt": dt_s, "base": BASE,
+        "step": REACH.0, "setpoint": setpoint, "y": y,
     })
 }
 
@@ -160,8 +193,9 @@ fn cascade(draw: &mut Draw, n: u32) -> Value {
     let mut bench = Bench::<TwoLoops>::start(&given, &[BASE]).unwrap();
     let (mut inner, mut outer) = (BASE, BASE);
     let mut y = Vec::new();
-    for i in 0..cycles {
-        bench.set_setpoint(if i >= 100 { BASE + 10.0 } else { BASE });
+    let setpoint = profile(draw, REACH.0, dt_s, cycles);
+    for wanted in &setpoint {
+        bench.set_setpoint(BASE + wanted);
         bench.set(bumpless_cascade::PV, outer);
         bench.set(INNER_PV, inner);
         let u = bench.step(dt_s).unwrap()[0];
@@ -175,12 +209,12 @@ fn cascade(draw: &mut Draw, n: u32) -> Value {
     }
     json!({
         "law": "cascade", "name": format!("cascade {n}"), "parameters": parameters(&given), "dt": dt_s, "base": BASE,
-        "inner": inner_s, "outer": outer_s, "step": 10.0, "y": y,
+        "inner": inner_s, "outer": outer_s, "step": REACH.0, "setpoint": setpoint, "y": y,
     })
 }
 
 /// A signal that stays for some cycles and then jumps.
-fn steps(draw: &mut Draw, cycles: usize) -> Vec<f64> {
+pub(crate) fn steps(draw: &mut Draw, cycles: usize) -> Vec<f64> {
     let mut signal = Vec::new();
     while signal.len() < cycles {
         let value = draw.between(-50.0, 50.0);

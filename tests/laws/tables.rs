@@ -8,7 +8,7 @@ use std::{fmt::Write as _, fs};
 use bumpless_sdk::{Controller, Description, Direction, Kind, ParameterSpec, PortSpec};
 use bumpless_tests::repository;
 
-fn laws() -> Vec<Description> {
+pub(crate) fn laws() -> Vec<Description> {
     fn of<C: Controller>() -> Description {
         C::DESCRIPTION
     }
@@ -65,19 +65,33 @@ fn parameter_row(p: &ParameterSpec) -> String {
 
 /// A law's tables. Rows that are the ISA block's stand with `pid` alone.
 fn tables(law: &Description) -> String {
-    let (isa_ports, isa_parameters) = (bumpless_isa::table::PORTS, bumpless_isa::table::PARAMETERS);
-    let name = |p: &ParameterSpec| p.name;
-    let is_isa = law.name != "pid"
-        && law.parameters.len() >= isa_parameters.len()
-        && law.parameters[..isa_parameters.len()]
-            .iter()
-            .map(name)
-            .eq(isa_parameters.iter().map(name));
+    use bumpless_isa::table::{BLOCK_PARAMETERS, BLOCK_PORTS, PARAMETERS, PORTS};
+    let begins_with = |rows: &[ParameterSpec]| {
+        let name = |p: &ParameterSpec| p.name;
+        law.parameters.len() >= rows.len()
+            && law
+                .parameters
+                .iter()
+                .map(name)
+                .take(rows.len())
+                .eq(rows.iter().map(name))
+    };
+    let whole = begins_with(BLOCK_PARAMETERS);
+    let is_isa = law.name != "pid" && begins_with(PARAMETERS);
+    let (isa_ports, isa_parameters) = if whole {
+        (BLOCK_PORTS, BLOCK_PARAMETERS)
+    } else {
+        (PORTS, PARAMETERS)
+    };
     let mut text = String::new();
     let (mut ports, mut parameters) = (law.ports, law.parameters);
     if is_isa {
         (ports, parameters) = (&ports[isa_ports.len()..], &parameters[isa_parameters.len()..]);
-        text += "All ports and parameters of [`pid`](#pid)";
+        text += if whole {
+            "All ports and parameters of [`pid`](#pid)"
+        } else {
+            "Ports and parameters of [`pid`](#pid) up to `no-fall` and `tell`"
+        };
         text += if ports.is_empty() && parameters.is_empty() {
             ".\n"
         } else {
@@ -141,6 +155,7 @@ fn the_items_of_a_pid_block_have_their_tests() {
                 "controllers/pid/tests/it",
                 "controllers/pidplus/tests",
                 "controllers/cascade/tests",
+                "host/core/src/seat",
             ];
             let found = folders.iter().any(|folder| {
                 let path = repository().join(folder).join(format!("{file}.rs"));

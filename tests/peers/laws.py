@@ -13,6 +13,11 @@ ends with 1 where one is NO.
 | mpc | scipy for the predictions, OSQP for the plan |
 | fuzzy | scikit-fuzzy |
 | autotune | python-control: margins and parameters of the true process |
+| ratio | python-control: zero-order hold of the filter; numpy for proportion, limits and the fading difference |
+| split-range | numpy: the PI as a sum of increments, both curves by interp |
+| gain-schedule | numpy: the PI as a sum of increments, gains by interp |
+| override-selector | scipy: the differential equations of both blocks, numpy's minimum or maximum, and both lags |
+| on-off | the positions by the rule's words; period and amplitude of the swing in closed form (Astrom and Hagglund 2006, ch. 8) |
 """
 
 import json
@@ -72,21 +77,33 @@ def pid(case):
     g = control.ss(transfer(case["plant"]) * dead_time(case["plant"]["delay"]))
     # u = c_r·r − c_y·y; the load comes in before the process.
     loop = control.feedback(g, c_y)
-    r = np.where(t >= 1.0 - 1e-9, case["step"], 0.0)
-    # The law's step goes out at the sample that saw it, and holds: in the mean half a sample late.
-    d = np.where(t >= t[len(t) // 2] - 1e-9, case["load"], 0.0)
-    from_setpoint = control.forced_response(control.ss(c_r * loop), t, np.interp(t - dt / 2, t, r)).outputs
-    from_load = control.forced_response(loop, t, d).outputs
-    lines = [tell(case, "continuous", worst(y, from_setpoint + from_load) / case["step"], 0.012)]
-    if p["beta"] == 1.0 and p["gamma"] == 0.0:
-        lines.append(tell(case, "simple-pid", simple_pid(case, y, t, r, d) / case["step"], 0.03))
+    r, d = np.array(case["setpoint"]), np.array(case["load"])
+    # Between two samples the reference is straight where the process saw a step: half a sample later it is the same in the mean.
+    # So is the law's output, which goes out at the sample that saw the setpoint, and holds.
+    half = lambda x: np.interp(t - dt / 2, t, x)
+    from_setpoint = control.forced_response(control.ss(c_r * loop), t, half(r)).outputs
+    from_load = control.forced_response(loop, t, half(d)).outputs
+    # A derivative of the setpoint makes of half a sample a kick of its size.
+    bound = 0.012 if p["gamma"] == 0.0 else 0.03
+    span = np.ptp(r)
+    lines = [tell(case, "continuous", worst(y, from_setpoint + from_load) / span, bound)]
+    if p["beta"] in (0.0, 1.0) and p["gamma"] in (0.0, 1.0):
+        lines.append(tell(case, "simple-pid", simple_pid(case, y, t, r, d) / span, 0.03))
     return lines
 
 
 def simple_pid(case, y, t, r, d):
     p, dt, plant = case["parameters"], case["dt"], case["plant"]
     # The derivative has no filter there, so ours is compared with its own time constant as the difference that it is.
-    peer = PID(p["k"], p["k"] / p["ti"], p["k"] * p["td"], setpoint=0, sample_time=None)
+    peer = PID(
+        p["k"],
+        p["k"] / p["ti"],
+        p["k"] * p["td"],
+        setpoint=0,
+        sample_time=None,
+        proportional_on_measurement=p["beta"] == 0.0,
+        differential_on_measurement=p["gamma"] == 0.0,
+    )
     g = control.sample_system(control.ss(transfer(plant)), dt, "zoh")
     x = np.zeros((g.nstates, 1))
     line = [0.0] * round(plant["delay"] / dt)
@@ -107,7 +124,7 @@ def smith(case):
     g = control.tf([p["model-gain"]], [p["model-lag"], 1])
     c = p["k"] * control.tf([p["ti"], 1], [p["ti"], 0])
     prompt = control.forced_response(
-        control.minreal(control.feedback(g * c, 1), verbose=False), t, np.where(t >= 1.0 - 1e-9, case["step"], 0.0)
+        control.minreal(control.feedback(g * c, 1), verbose=False), t, np.array(case["setpoint"])
     ).outputs
     late = np.interp(t - p["model-delay"], t, prompt, left=0.0)
     return [tell(case, "without dead time, then late", worst(y, late) / case["step"], 0.012)]
@@ -122,7 +139,7 @@ def cascade(case):
 
     def slope(now, x):
         inner, outer, reset, integral = x
-        r = case["step"] if now >= 1.0 else 0.0
+        r = case["setpoint"][min(int(now / dt + 1e-9), len(t) - 1)]
         wanted = k * (r - outer) + reset
         u = ki * (wanted - inner) + integral
         # The outer integral follows the inner measurement; the inner one is a plain PI.
@@ -323,7 +340,113 @@ def autotune(case):
     ]
 
 
+def ratio(case):
+    p, dt, wild = case["parameters"], case["dt"], np.array(case["wild"])
+    if p["wild-filter"] > 0:
+        # The law's filter has seen the newest value when it answers: one sample ahead of a hold.
+        wild = zero_order_hold(0.0, p["wild-filter"], dt, np.append(wild, wild[-1]), wild[0])[1:]
+    natural = np.clip(case["ratio"], p["ratio-low"], p["ratio-high"]) * wild + p["bias"]
+    left = (case["held"] - natural[0]) * np.exp(-np.arange(len(wild)) * dt / p["balance-time"])
+    expected = np.clip(natural + left, p["out-low"], p["out-high"])
+    assert np.ptp(expected) > 20 and (expected == p["out-high"]).any()
+    return [tell(case, "proportion", worst(case["out"], expected), 1e-9)]
+
+
+def increments(gains, ti, dt, error, first):
+    """A PI as the sum of its increments, with gains that may differ from step to step: u moves by what P and I move by."""
+    gains, ti, error = np.broadcast_to(gains, error.shape), np.broadcast_to(ti, error.shape), error
+    steps = gains[1:] * (np.diff(error) + (1 - np.exp(-dt / ti[1:])) * error[:-1])
+    return first + np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def split_range(case):
+    p = case["parameters"]
+    u = increments(p["k"], p["ti"], case["dt"], np.array(case["setpoint"]) - np.array(case["pv"]), case["u"])
+    a_end, b_end = p["split"] - p["gap"] / 2, p["split"] + p["gap"] / 2
+    assert 0 < u.min() < min(a_end, b_end) and max(a_end, b_end) < u.max() < 100, (u.min(), u.max())
+    a = np.interp(u, [0, a_end], [p["a-low"], p["a-split"]])
+    b = np.interp(u, [b_end, 100], [p["b-split"], p["b-high"]])
+    return [tell(case, "A", worst(case["a"], a), 1e-6), tell(case, "B", worst(case["b"], b), 1e-6)]
+
+
+def gain_schedule(case):
+    p = case["parameters"]
+    by = np.array(case["schedule"] if p["by"] == 0.0 else case["pv"])
+    points = [p["x1"], p["x2"], p["x3"], p["x4"]]
+    gains = np.interp(by, points, [p["k"], p["k2"], p["k3"], p["k4"]])
+    ti = np.interp(by, points, [p["ti"], p["ti2"], p["ti3"], p["ti4"]])
+    assert by.min() < points[0] + 5 and by.max() > points[2], (by.min(), by.max())
+    error = np.array(case["setpoint"]) - np.array(case["pv"])
+    expected = increments(gains, ti, case["dt"], error, case["base"])
+    return [tell(case, "increments with gains by interp", worst(case["out"], expected), 1e-7)]
+
+
+def override_selector(case):
+    p, dt = case["parameters"], case["dt"]
+    t = np.arange(len(case["y"])) * dt
+    pick = np.maximum if p["select"] == 1.0 else np.minimum
+    free, g = case["free"], case["limit_gain"]
+
+    def slope(now, state):
+        y, x, main, limit = state
+        r = case["beyond"] if case["turns"][0] <= now < case["turns"][1] else free
+        u = pick(p["k"] * (r - y) + main, p["limit-k"] * (p["limit-sp"] - x) + limit)
+        return [
+            (u - y) / case["lag"],
+            (g * u - x) / case["limit_lag"],
+            (u - main) / p["ti"],
+            (u - limit) / p["limit-ti"],
+        ]
+
+    # At rest both integrals are the actuator's value less what P wants.
+    begin = [free, g * free, free, free - p["limit-k"] * (p["limit-sp"] - g * free)]
+    answer = solve_ivp(slope, (0, t[-1]), begin, t_eval=t, max_step=0.02, rtol=1e-8, atol=1e-9)
+    reached = abs(p["limit-sp"] - answer.y[1]).min()
+    assert reached < 0.05 * p["limit-sp"], "the limit is met"
+    span = abs(case["beyond"] - free)
+    return [
+        tell(case, "main", worst(case["y"], answer.y[0]) / span, 0.01),
+        tell(case, "limit", worst(case["x"], answer.y[1]) / (g * span), 0.01),
+    ]
+
+
+def on_off(case):
+    p, dt = case["parameters"], case["dt"]
+    on_value, off_value = p.get("on-value", 100.0), p.get("off-value", 0.0)
+    sign = -1.0 if p["action"] == 1.0 else 1.0
+    cold = sign * (case["setpoint"] - np.array(case["pv"])) > p["hysteresis"] / 2
+    hot = sign * (np.array(case["pv"]) - case["setpoint"]) > p["hysteresis"] / 2
+    on, since, expected = False, -1, []
+    for i in range(len(cold)):
+        shortest = p.get("on-min", 0.0) if on else p.get("off-min", 0.0)
+        # The first cycle of a law keeps the position.
+        if i > 0 and (i - since) * dt >= shortest - 1e-9 and (hot[i] if on else cold[i]):
+            on, since = not on, i
+        expected.append(on_value if on else off_value)
+    wrong = int(np.sum(np.array(expected) != np.array(case["out"])))
+    lines = [tell(case, "positions that differ", wrong, 0)]
+    if "plant" in case:
+        gain, lag, delay = case["plant"]["gain"], case["plant"]["lags"][1], case["plant"]["delay"]
+        swing, band = gain * (on_value - off_value) / 2, p["hysteresis"] / 2
+        half = lag * np.log((2 * np.exp(delay / lag) - 1 + band / swing) / (1 - band / swing))
+        amplitude = swing * (1 - np.exp(-delay / lag)) + band * np.exp(-delay / lag)
+        ups = np.flatnonzero(np.diff(case["out"]) > 0)
+        assert len(ups) > 5
+        period = float(np.mean(np.diff(ups[2:]))) * dt
+        settled = np.array(case["pv"])[ups[2] :] - case["setpoint"]
+        lines += [
+            tell(case, "period", abs(period / (2 * half) - 1), 0.02),
+            tell(case, "amplitude", abs(np.ptp(settled) / (2 * amplitude) - 1), 0.02),
+        ]
+    return lines
+
+
 LAWS = {
+    "ratio": ratio,
+    "split-range": split_range,
+    "gain-schedule": gain_schedule,
+    "override-selector": override_selector,
+    "on-off": on_off,
     "pid": pid,
     "smith": smith,
     "cascade": cascade,

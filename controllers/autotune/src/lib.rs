@@ -297,7 +297,7 @@ impl Controller for Autotune {
 
     fn step(state: &mut State, parameters: &Parameters<'_>, cycle: &Cycle, io: &mut Io<'_>) -> Result<(), Fault> {
         let held = block::held(io, OUT);
-        let output = match block::take(&mut state.pid, cycle, io, held, block::always)? {
+        let output = match block::take(&mut state.pid, parameters, cycle, io, held, block::always)? {
             Intake::Blind(value) => {
                 if state.under_way.is_some() {
                     state.end(Err(Failure::Taken), io);

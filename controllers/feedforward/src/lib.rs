@@ -92,7 +92,7 @@ impl Controller for Feedforward {
         let disturbance = io.read_usable(FF).map(|r| r.value);
         let added = state.path.step(&dynamics(parameters), disturbance, cycle.dt_s());
         let held = block::held(io, OUT);
-        let output = match block::take(&mut state.pid, cycle, io, held, block::always)? {
+        let output = match block::take(&mut state.pid, parameters, cycle, io, held, block::always)? {
             Intake::Blind(value) => value,
             Intake::Seen(mut sample, _) => {
                 sample.feedforward = added;

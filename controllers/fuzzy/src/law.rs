@@ -188,7 +188,7 @@ impl Memory {
                 let reached = rate_limit(self.integral + rest, sample.held, t.out_rate_per_s, sample.dt_s);
                 limit(reached, t.out_low, t.out_high)
             }
-            (Demand::Automatic, Phase::New | Phase::Following) => {
+            (Demand::Automatic, Phase::New | Phase::Following | Phase::Bypassed) => {
                 self.phase = Phase::Running;
                 self.integral = sample.held - rest;
                 limit(sample.held, t.out_low, t.out_high)

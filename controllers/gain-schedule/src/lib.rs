@@ -110,7 +110,7 @@ impl Controller for GainSchedule {
 
     fn step(state: &mut Scheduled, parameters: &Parameters<'_>, cycle: &Cycle, io: &mut Io<'_>) -> Result<(), Fault> {
         let held = block::held(io, OUT);
-        let output = match block::take(&mut state.pid, cycle, io, held, block::always)? {
+        let output = match block::take(&mut state.pid, parameters, cycle, io, held, block::always)? {
             Intake::Blind(value) => value,
             Intake::Seen(sample, _) => {
                 let value = match parameters.choice(BY) {

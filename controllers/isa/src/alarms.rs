@@ -61,6 +61,12 @@ const WATCHES: [Watch; 6] = [
 
 /// A limit of this size is none.
 const NONE: f64 = 1e9;
+/// The bits of [`WATCHES`].
+const WATCHED: u8 = (1 << WATCHES.len()) - 1;
+/// The bit that says that the actual mode was told.
+pub(crate) const MODE: u8 = 1 << 6;
+/// The bit that says that doubtful inputs were told.
+pub(crate) const QUALITY: u8 = 1 << 7;
 
 const fn watch(name: &'static str, text: &'static str, priority: Priority, limit: Parameter, side: Side) -> Watch {
     Watch {
@@ -72,9 +78,19 @@ const fn watch(name: &'static str, text: &'static str, priority: Priority, limit
     }
 }
 
+/// Nothing is measured any more: clears what is active of the measurement's.
+pub(crate) fn clear(active: u8, io: &mut Io<'_>) -> u8 {
+    for (i, watch) in WATCHES.iter().enumerate() {
+        if active & 1 << i != 0 {
+            io.clear(watch.name);
+        }
+    }
+    active & !WATCHED
+}
+
 /// Looks at one measurement; gives which alarms are active now, one bit each.
 pub(crate) fn tell(active: u8, p: &Parameters<'_>, pv: f64, setpoint: f64, io: &mut Io<'_>) -> u8 {
-    let mut now = 0;
+    let mut now = active & !WATCHED;
     for (i, watch) in WATCHES.iter().enumerate() {
         let limit = p.of(watch.limit);
         let bit = 1 << i;

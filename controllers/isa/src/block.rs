@@ -9,19 +9,45 @@ use bumpless_sdk::prelude::*;
 
 use crate::{
     alarms,
+    chain::{self, Links},
     law::{Demand, Memory, Memory1, Sample},
-    table::{FF, HOLD, OUT, PARAMETERS, PORTS, PV, REMOTE_ON, REMOTE_SP, RESET, TRACK, TRACK_ON},
+    mode::{self, Actual},
+    table::{
+        BLOCK_PARAMETERS, BLOCK_PORTS, BYPASS_ON, FF, HOLD, NO_FALL, NO_RISE, ON_UNCERTAIN, OOS, OUT, PV, REMOTE_ON,
+        REMOTE_SP, RESET, TELL, TRACK, TRACK_ON,
+    },
     tuning::Tuning,
 };
+use serde::{Deserialize, Serialize};
 
-/// Layout of [`Memory`] in the state bytes, the same for every ISA-form controller.
-pub const STATE_LAYOUT: u32 = 2;
+/// Layout of [`Block`] in the state bytes of the [`FAMILY`].
+pub const STATE_LAYOUT: u32 = 3;
 
-/// Controllers that read each other's state, in layouts 1 and [`STATE_LAYOUT`].
+/// Controllers that read each other's state, in layouts 1 to [`STATE_LAYOUT`].
 pub const FAMILY: [&str; 2] = ["pid", "pidplus"];
 
 /// How many parameters layout 1 had: the first ones of today's table.
 const PARAMETERS_1: usize = 15;
+/// As many had layout 2.
+const PARAMETERS_2: usize = 27;
+
+/// The state of the block by itself.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Block {
+    /// The law's.
+    pub memory: Memory,
+    /// The chain's.
+    pub links: Links,
+}
+
+impl From<Memory> for Block {
+    fn from(memory: Memory) -> Self {
+        Self {
+            memory,
+            links: Links::default(),
+        }
+    }
+}
 
 /// When a measurement counts. Given: the time waited since the last one that did (s, to be kept up to date), the time since
 /// the step before (s) and whether a new sample arrived. Gives ΔT (s) if this one counts.
@@ -41,8 +67,8 @@ pub const fn description(name: &'static str, version: &'static str, text: &'stat
         name,
         version,
         text,
-        ports: PORTS,
-        parameters: PARAMETERS,
+        ports: BLOCK_PORTS,
+        parameters: BLOCK_PARAMETERS,
         state_layout: STATE_LAYOUT,
     }
 }
@@ -68,24 +94,55 @@ pub fn held(io: &Io<'_>, output: Output) -> Option<f64> {
     Some(io.held(output)).filter(Reading::is_usable).map(|r| r.value)
 }
 
-/// Reads the ports of the block. `held` is what the actuator holds, in the law's units.
+/// Reads the ports that every law around the block has. `held` is what the actuator holds, in the law's units.
 ///
 /// Fails with [`Fault::BadInput`] in automatic without a usable measurement, or where the setpoint is no number.
 pub fn take(
     memory: &mut Memory,
+    parameters: &Parameters<'_>,
     cycle: &Cycle,
     io: &Io<'_>,
     held: Option<f64>,
     timing: Timing,
 ) -> Result<Intake, Fault> {
     let demand = demand(memory.output, cycle, io, held, (TRACK, TRACK_ON));
-    let Some(pv) = io.read_usable(PV) else {
-        let Demand::Follow(value) = demand else {
-            return Err(Fault::bad_input("pv has no usable value"));
-        };
-        memory.follow_blind(value);
-        return Ok(Intake::Blind(value));
-    };
+    intake(memory, parameters, cycle, io, held, timing, (demand, false))
+}
+
+/// The measurement, and whether the integral may live on it. None where it is not usable, or counts as bad.
+fn measurement(parameters: &Parameters<'_>, io: &Io<'_>) -> Option<(Reading, bool)> {
+    let pv = io.read_usable(PV)?;
+    match pv.quality {
+        Quality::Uncertain => match parameters.choice(ON_UNCERTAIN) {
+            0 => Some((pv, true)),
+            1 => Some((pv, false)),
+            _ => None,
+        },
+        _ => Some((pv, true)),
+    }
+}
+
+fn intake(
+    memory: &mut Memory,
+    parameters: &Parameters<'_>,
+    cycle: &Cycle,
+    io: &Io<'_>,
+    held: Option<f64>,
+    timing: Timing,
+    (demand, bypass): (Demand, bool),
+) -> Result<Intake, Fault> {
+    let seen = measurement(parameters, io);
+    if seen.is_none() {
+        match demand {
+            Demand::Follow(value) => {
+                memory.follow_blind(value);
+                return Ok(Intake::Blind(value));
+            }
+            // What goes through needs no measurement.
+            Demand::Automatic if bypass => {}
+            Demand::Automatic => return Err(Fault::bad_input("pv has no usable value")),
+        }
+    }
     let remote = is_on(io, REMOTE_ON);
     let setpoint = if remote {
         // Another block that fails leaves its last wish.
@@ -97,8 +154,10 @@ pub fn take(
         return Err(Fault::bad_input("the setpoint is not a finite number"));
     }
     let dt_s = cycle.dt_s();
+    let (pv, fresh, feeds) = seen.map_or((memory.pv, false, false), |(pv, feeds)| (pv.value, pv.fresh, feeds));
+    let elapsed_s = timing(&mut memory.waited_s, dt_s, fresh);
     let sample = Sample {
-        pv: pv.value,
+        pv,
         setpoint,
         // A feedforward that fails stays where it was: to drop it would bump the output.
         feedforward: if io.is_connected(FF) {
@@ -109,12 +168,15 @@ pub fn take(
         held,
         demand,
         dt_s,
-        elapsed_s: timing(&mut memory.waited_s, dt_s, pv.fresh),
+        elapsed_s: elapsed_s.filter(|_| seen.is_some()),
         remote,
-        hold: is_on(io, HOLD),
+        hold: !feeds || is_on(io, HOLD),
+        no_rise: is_on(io, NO_RISE),
+        no_fall: is_on(io, NO_FALL),
+        bypass,
         reset: io.read_usable(RESET).map(|r| r.value),
     };
-    Ok(Intake::Seen(sample, pv.fresh))
+    Ok(Intake::Seen(sample, fresh))
 }
 
 /// Steps the law and tells alarms about what was `measured`. Gives the output.
@@ -138,20 +200,60 @@ pub fn conclude(
     Ok(output)
 }
 
-/// One cycle of the block alone. Without a usable measurement: a [`Fault::BadInput`] in automatic, following in manual and
+/// One cycle of the block by itself. Without a usable measurement: a [`Fault::BadInput`] in automatic, following in manual and
 /// while tracking.
 pub fn step(
-    memory: &mut Memory,
+    block: &mut Block,
     parameters: &Parameters<'_>,
     cycle: &Cycle,
     io: &mut Io<'_>,
     timing: Timing,
 ) -> Result<(), Fault> {
+    let Block { memory, links } = block;
     let held = held(io, OUT);
-    let output = match take(memory, cycle, io, held, timing)? {
-        Intake::Blind(value) => value,
-        Intake::Seen(sample, _) => conclude(memory, &Tuning::of(parameters), parameters, &sample, sample.pv, io)?,
+    let out_of_service = is_on(io, OOS);
+    // A loop below that says nothing is one that does not take the output.
+    let initialises = links.hear(parameters, io) && links.below.is_none_or(|report| report.has(chain::INITIALISE));
+    let actual = Actual::of(cycle, io, out_of_service, initialises);
+    let mut demand = demand(memory.output, cycle, io, held, (TRACK, TRACK_ON));
+    let stays = held.unwrap_or(memory.output);
+    match actual {
+        Actual::OutOfService => demand = Demand::Follow(stays),
+        Actual::Initialisation => {
+            let below = links.below.filter(|report| !report.has(chain::NO_VALUE));
+            demand = Demand::Follow(below.map_or(stays, |report| report.value));
+        }
+        _ => {}
+    }
+    let tuning = Tuning::of(parameters);
+    let output = if out_of_service {
+        memory.alarms = alarms::clear(memory.alarms, io);
+        memory.follow_blind(stays);
+        stays
+    } else {
+        let bypass = is_on(io, BYPASS_ON);
+        match intake(memory, parameters, cycle, io, held, timing, (demand, bypass))? {
+            Intake::Blind(value) => value,
+            Intake::Seen(mut sample, _) => {
+                if let Some(report) = links.below {
+                    sample.no_rise |= report.has(chain::NO_RISE);
+                    sample.no_fall |= report.has(chain::NO_FALL);
+                    let value = (!report.has(chain::NO_VALUE)).then_some(report.value);
+                    sample.reset = sample.reset.or(value);
+                }
+                conclude(memory, &tuning, parameters, &sample, sample.pv, io)?
+            }
+        }
     };
+    links.report(memory, &tuning, parameters, actual == Actual::Cascade, io);
+    let told = parameters.choice(TELL);
+    if told != 0 || memory.alarms & (alarms::MODE | alarms::QUALITY) != 0 {
+        let shed = actual.shed(cycle, io).filter(|_| told & 1 != 0);
+        memory.alarms = mode::tell(memory.alarms, alarms::MODE, "mode", shed, io);
+        let doubtful = told & 2 != 0 && !out_of_service && mode::is_doubtful(io);
+        let text = doubtful.then_some("the output rests on an input that is uncertain, or failed and was replaced");
+        memory.alarms = mode::tell(memory.alarms, alarms::QUALITY, "quality", text, io);
+    }
     io.write(OUT, output);
     Ok(())
 }
@@ -185,16 +287,22 @@ pub fn retune(memory: &mut Memory, old: &Parameters<'_>, new: &Parameters<'_>) -
 }
 
 /// Takes over the state of another controller of the [`FAMILY`], or of an older layout, with whatever parameters it ran.
-pub fn adopt(from: &Origin<'_>, parameters: &Parameters<'_>) -> Result<Option<Memory>, Fault> {
+pub fn adopt_block(from: &Origin<'_>, parameters: &Parameters<'_>) -> Result<Option<Block>, Fault> {
     if !FAMILY.contains(&from.name) {
         return Ok(None);
     }
     let old = from.open()?;
-    let mut memory: Memory = match (from.state_layout, old.parameters.count()) {
-        (1, PARAMETERS_1) => old.law::<Memory1>()?.into(),
-        (STATE_LAYOUT, count) if count == PARAMETERS.len() => old.law()?,
+    let mut block: Block = match (from.state_layout, old.parameters.count()) {
+        (1, PARAMETERS_1) => Memory::from(old.law::<Memory1>()?).into(),
+        (2, PARAMETERS_2) => old.law::<Memory>()?.into(),
+        (STATE_LAYOUT, count) if count == BLOCK_PARAMETERS.len() => old.law()?,
         _ => return Ok(None),
     };
-    retune(&mut memory, &old.parameters, parameters)?;
-    Ok(Some(memory))
+    retune(&mut block.memory, &old.parameters, parameters)?;
+    Ok(Some(block))
+}
+
+/// As [`adopt_block`], for a law around the block.
+pub fn adopt(from: &Origin<'_>, parameters: &Parameters<'_>) -> Result<Option<Memory>, Fault> {
+    Ok(adopt_block(from, parameters)?.map(|block| block.memory))
 }

@@ -31,11 +31,15 @@
 //!    │                           ▲      manual, track-on    │
 //!    │                           └──────────────────────────┘
 //!    └── automatic: y, d from this sample; I = H − (P+D+F) ──► Running
+//!
+//!   New, Following, Running ── bypass, automatic: I = H − r ──► Bypassed ── no bypass: as from Following ──► Running
 //! ```
 //! The first automatic step from `New` or `Following` gives exactly what the actuator holds, whatever the error, and D starts
 //! from rest.
 //! The setpoint r is the given one within its limits and, where it has a rate, on its way to it. When its source changes, the
-//! integral takes what P would jump by. *Hold* leaves I as it is; *reset* puts another value in H's place.
+//! integral takes what P would jump by. *Hold* leaves I as it is; *no rise* and *no fall* do so one way, and so does the output
+//! beyond its anti-windup limits; *reset* puts another value in H's place. In *bypass* the output is the setpoint in the
+//! output's place, and I is what is left of the difference at the transfer, which fades with `balance-time`.
 //! Never: a panic; numbers out of range give a number out of range, which the glue refuses.
 
 use bumpless_sdk::blocks::{dead_band, derivative, lag_part, limit, rate_limit};
@@ -52,6 +56,8 @@ pub enum Phase {
     Following,
     /// The law decides.
     Running,
+    /// The setpoint goes through to the output.
+    Bypassed,
 }
 
 /// Who decides the output in a step.
@@ -84,6 +90,12 @@ pub struct Sample {
     pub remote: bool,
     /// Does the integral stand still?
     pub hold: bool,
+    /// May the integral not raise the output: would more of it be of no use?
+    pub no_rise: bool,
+    /// May it not lower the output?
+    pub no_fall: bool,
+    /// Does the setpoint go through to the output?
+    pub bypass: bool,
     /// What the integral follows instead of the actuator, where that is told.
     pub reset: Option<f64>,
 }
@@ -102,6 +114,9 @@ impl Sample {
             elapsed_s: Some(dt_s),
             remote: false,
             hold: false,
+            no_rise: false,
+            no_fall: false,
+            bypass: false,
             reset: None,
         }
     }
@@ -171,7 +186,7 @@ pub struct Memory {
     pub waited_s: f64,
     /// Was the setpoint another block's in the last step?
     pub remote: bool,
-    /// Alarms that are active, one bit each; the glue's own.
+    /// Alarms that are active, and whether mode and quality are told as out of the ordinary, one bit each; the glue's own.
     pub alarms: u8,
 }
 
@@ -222,7 +237,7 @@ impl Memory {
         };
         if let (Phase::Running, Some(elapsed_s), false) = (self.phase, sample.elapsed_s, sample.hold) {
             // Uses the memory of the step before, to which `held` belongs: must come before `observe`.
-            self.integrate(t, sample.reset.unwrap_or(held), elapsed_s);
+            self.integrate(t, sample, sample.reset.unwrap_or(held), elapsed_s);
         }
         self.observe(t, sample);
         let rest = self.rest(t);
@@ -232,12 +247,24 @@ impl Memory {
                 self.integral = value - rest;
                 value
             }
+            (Demand::Automatic, phase) if sample.bypass => {
+                let natural = t.through(self.setpoint);
+                if matches!(phase, Phase::Bypassed) {
+                    self.integral -= self.integral * lag_part(t.balance_s, sample.dt_s);
+                    let reached = rate_limit(natural + self.integral, held, t.out_rate_per_s, sample.dt_s);
+                    limit(reached, t.out_low, t.out_high)
+                } else {
+                    self.phase = Phase::Bypassed;
+                    self.integral = held - natural;
+                    limit(held, t.out_low, t.out_high)
+                }
+            }
             (Demand::Automatic, Phase::Running) => {
                 let wanted = self.integral + rest;
                 let reached = rate_limit(wanted, held, t.out_rate_per_s, sample.dt_s);
                 limit(reached, t.out_low, t.out_high)
             }
-            (Demand::Automatic, Phase::New | Phase::Following) => {
+            (Demand::Automatic, Phase::New | Phase::Following | Phase::Bypassed) => {
                 self.phase = Phase::Running;
                 self.integral = held - rest;
                 limit(held, t.out_low, t.out_high)
@@ -246,10 +273,18 @@ impl Memory {
         self.output
     }
 
-    fn integrate(&mut self, t: &Tuning, held: f64, elapsed_s: f64) {
+    fn integrate(&mut self, t: &Tuning, sample: &Sample, held: f64, elapsed_s: f64) {
         if t.ti_s > 0.0 {
             let missing = held - (self.integral + self.rest(t));
-            self.integral += (missing + t.gain * self.error(t)) * lag_part(t.ti_s, elapsed_s);
+            let change = (missing + t.gain * self.error(t)) * lag_part(t.ti_s, elapsed_s);
+            let barred = if change > 0.0 {
+                sample.no_rise || self.output > t.arw_high
+            } else {
+                sample.no_fall || self.output < t.arw_low
+            };
+            if !barred {
+                self.integral += change;
+            }
         } else {
             self.integral += (t.bias - self.integral) * lag_part(t.balance_s, elapsed_s);
         }
@@ -280,9 +315,12 @@ impl Memory {
             self.setpoint = setpoint;
             self.integral += before - self.rest(t);
             self.derivative_setpoint = setpoint;
+        } else if self.phase == Phase::Bypassed && sample.remote != self.remote {
+            self.integral += t.through(self.setpoint) - t.through(setpoint);
         }
         self.remote = sample.remote;
-        if self.phase == Phase::New {
+        // In bypass the measurement may have been missing for long: nothing of an old one is to be filtered on.
+        if matches!(self.phase, Phase::New | Phase::Bypassed) {
             self.pv = sample.pv;
             self.derivative = 0.0;
             self.derivative_setpoint = setpoint;
@@ -292,7 +330,7 @@ impl Memory {
             self.derivative = match self.phase {
                 Phase::Running => derivative(self.derivative, change, t.td_s, t.td_filter_s, elapsed_s),
                 // Starts from rest: a D that was balanced at the transfer would fade after it and pull the output along.
-                Phase::New | Phase::Following => 0.0,
+                _ => 0.0,
             };
             self.derivative_setpoint = setpoint;
             self.pv = pv;
@@ -317,6 +355,10 @@ impl Memory {
     pub fn retune(&mut self, old: &Tuning, new: &Tuning) {
         // The way through the output rounds; without a change nothing may differ, not even in the last bit.
         if old == new {
+            return;
+        }
+        if self.phase == Phase::Bypassed {
+            self.integral += old.through(self.setpoint) - new.through(self.setpoint);
             return;
         }
         let wanted = self.integral + self.rest(old);

@@ -14,6 +14,9 @@ mod law;
 pub use law::{Demand, Memory, Memory1, Phase, Sample};
 
 mod alarms;
+mod mode;
+pub use mode::Actual;
 
 pub mod block;
+pub mod chain;
 pub mod station;

@@ -1,9 +1,12 @@
 //! Ports and parameters of the ISA-form controllers, and their handles.
 //!
+//! [`PORTS`] and [`PARAMETERS`] are what every law around the block has; [`BLOCK_PORTS`] and [`BLOCK_PARAMETERS`] go on with what
+//! only the block by itself has (`pid`, `pidplus`): out of service, bypass, and its place in a chain of loops.
+//!
 //! Names and meanings follow ISA-TR5.9-2023 (PID algorithms and performance) and the Foundation Fieldbus PID block
 //! (`BAL_TIME`, `FF_GAIN`, `TRK_IN_D`, `TRK_VAL`). Never: a value; those ride in the state.
 
-use bumpless_sdk::{Input, Output, Parameter, ParameterSpec, PortSpec};
+use bumpless_sdk::{Input, Output, Parameter, ParameterSpec, PortSpec, joined};
 
 /// The ports.
 pub const PORTS: &[PortSpec] = &[
@@ -24,7 +27,21 @@ pub const PORTS: &[PortSpec] = &[
         "",
         "External reset: what the integral follows instead of the actuator's reading",
     ),
+    PortSpec::digital_input(
+        "no-rise",
+        "Bars the integral from raising the output: more would be of no use",
+    ),
+    PortSpec::digital_input("no-fall", "Bars the integral from lowering the output"),
 ];
+
+/// The ports of the block by itself.
+pub const BLOCK_PORTS: &[PortSpec] = &joined::<_, { PORTS.len() + 2 }>(
+    PORTS,
+    &[
+        PortSpec::digital_input("bypass-on", "Sends the setpoint through to the output"),
+        PortSpec::digital_input("oos", "Out of service: the output stays, and nothing is looked at"),
+    ],
+);
 
 /// Measurement.
 pub const PV: Input = Input::of(PORTS, "pv");
@@ -40,6 +57,14 @@ pub const OUT: Output = Output::of(PORTS, "out");
 pub const REMOTE_SP: Input = Input::of(PORTS, "remote-sp");
 /// Is it used?
 pub const REMOTE_ON: Input = Input::of(PORTS, "remote-on");
+/// Is more output of no use?
+pub const NO_RISE: Input = Input::of(PORTS, "no-rise");
+/// Is less output of no use?
+pub const NO_FALL: Input = Input::of(PORTS, "no-fall");
+/// Does the setpoint go through?
+pub const BYPASS_ON: Input = Input::of(BLOCK_PORTS, "bypass-on");
+/// Is the block out of service?
+pub const OOS: Input = Input::of(BLOCK_PORTS, "oos");
 /// Does the integral stand still?
 pub const HOLD: Input = Input::of(PORTS, "hold");
 /// What the integral follows.
@@ -213,11 +238,82 @@ pub const PARAMETERS: &[ParameterSpec] = &[
         1e9,
         "How far the measurement must come back before an alarm goes",
     ),
+    // Since layout 3 of `pid`.
+    ParameterSpec::number(
+        "arw-low",
+        "out",
+        -1e9,
+        -1e9,
+        1e9,
+        "Below this output the integral does not lower it further; -1e9 for none",
+    ),
+    ParameterSpec::number(
+        "arw-high",
+        "out",
+        1e9,
+        -1e9,
+        1e9,
+        "Above this output the integral does not raise it further; 1e9 for none",
+    ),
+    ParameterSpec::number(
+        "ff-span",
+        "ff",
+        0.0,
+        0.0,
+        1e9,
+        "Range of the feedforward: where it is not 0, ff-gain is in parts of the output's range per part of this one",
+    ),
+    ParameterSpec::choice(
+        "on-uncertain",
+        &["use", "hold", "bad"],
+        "What a measurement of uncertain quality, as at the end of its instrument's range, is for the law: as good, no food for the integral, or none",
+    ),
+    ParameterSpec::choice(
+        "tell",
+        &["nothing", "mode", "quality", "both"],
+        "Whether an alarm of low priority tells that the block works in another mode than it was put in, or with inputs that are not good",
+    ),
 ];
+
+/// The parameters of the block by itself.
+pub const BLOCK_PARAMETERS: &[ParameterSpec] = &joined::<_, { PARAMETERS.len() + 4 }>(
+    PARAMETERS,
+    &[
+        ParameterSpec::number(
+            "bkcal-in",
+            "",
+            0.0,
+            0.0,
+            9999.0,
+            "Number of the link by which the loop below reports, whose setpoint this output is; 0 for none",
+        ),
+        ParameterSpec::number(
+            "bkcal-out",
+            "",
+            0.0,
+            0.0,
+            9999.0,
+            "Number of the link by which this block reports to the loop above, whose output its remote setpoint is; 0 for none",
+        ),
+        ParameterSpec::choice(
+            "bkcal-value",
+            &["setpoint", "measurement"],
+            "What it reports: the setpoint that it follows, or its measurement",
+        ),
+        ParameterSpec::number(
+            "bkcal-band",
+            "%",
+            0.5,
+            0.0,
+            50.0,
+            "How far the output must leave a limit, in % of its range, before the limit is reported no more",
+        ),
+    ],
+);
 
 macro_rules! handles {
     ($($(#[$doc:meta])* $handle:ident = $name:literal;)*) => {
-        $($(#[$doc])* pub const $handle: Parameter = Parameter::of(PARAMETERS, $name);)*
+        $($(#[$doc])* pub const $handle: Parameter = Parameter::of(BLOCK_PARAMETERS, $name);)*
     };
 }
 
@@ -276,4 +372,22 @@ handles! {
     DV_LO = "dv-lo";
     /// Hysteresis of the alarms.
     ALARM_BAND = "alarm-band";
+    /// Lower anti-windup limit.
+    ARW_LOW = "arw-low";
+    /// Upper anti-windup limit.
+    ARW_HIGH = "arw-high";
+    /// Range of the feedforward.
+    FF_SPAN = "ff-span";
+    /// What an uncertain measurement is.
+    ON_UNCERTAIN = "on-uncertain";
+    /// What is told.
+    TELL = "tell";
+    /// Link to the loop below.
+    BKCAL_IN = "bkcal-in";
+    /// Link to the loop above.
+    BKCAL_OUT = "bkcal-out";
+    /// What is reported to it.
+    BKCAL_VALUE = "bkcal-value";
+    /// Hysteresis of the reported limits.
+    BKCAL_BAND = "bkcal-band";
 }

@@ -54,7 +54,14 @@ pub struct Tuning {
     pub sp_rate_per_s: f64,
     /// Does the setpoint follow the measurement while something else decides the output?
     pub sp_track: bool,
+    /// Below this output the integral does not lower it further.
+    pub arw_low: f64,
+    /// Above this output the integral does not raise it further.
+    pub arw_high: f64,
 }
+
+/// A limit of this size is none.
+pub(crate) const NO_LIMIT: f64 = 1e9;
 
 /// A value, or the default of the table that a state of an older layout does not have yet.
 fn value(p: &Parameters<'_>, parameter: Parameter) -> f64 {
@@ -92,6 +99,8 @@ impl Tuning {
             sp_high: 1e9,
             sp_rate_per_s: 0.0,
             sp_track: false,
+            arw_low: -NO_LIMIT,
+            arw_high: NO_LIMIT,
         }
     }
 
@@ -128,7 +137,7 @@ impl Tuning {
             out_high: p.of(table::OUT_HIGH),
             out_rate_per_s: p.of(table::OUT_RATE),
             dead_band: p.of(table::DEAD_BAND),
-            ff_gain: p.of(table::FF_GAIN),
+            ff_gain: p.of(table::FF_GAIN) * ff_scale(p),
             bias: p.of(table::BIAS),
             balance_s: p.of(table::BALANCE_TIME),
             pv_filter_s: p.of(table::PV_FILTER),
@@ -136,6 +145,20 @@ impl Tuning {
             sp_high: value(p, table::SP_HIGH),
             sp_rate_per_s: value(p, table::SP_RATE),
             sp_track: value(p, table::SP_TRACK) >= 1.0,
+            arw_low: value(p, table::ARW_LOW),
+            arw_high: value(p, table::ARW_HIGH),
+        }
+    }
+
+    /// The output that a setpoint means in bypass: its place within its limits becomes the place within the output's; where the
+    /// setpoint has no limits, it is the output.
+    #[must_use]
+    pub fn through(&self, setpoint: f64) -> f64 {
+        if self.sp_low > -NO_LIMIT && self.sp_high < NO_LIMIT {
+            let part = (setpoint - self.sp_low) / (self.sp_high - self.sp_low);
+            self.out_low + part * (self.out_high - self.out_low)
+        } else {
+            setpoint
         }
     }
 
@@ -147,6 +170,9 @@ impl Tuning {
         if self.sp_low >= self.sp_high {
             return Err(Fault::bad_parameter("sp-low must be less than sp-high"));
         }
+        if self.arw_low >= self.arw_high {
+            return Err(Fault::bad_parameter("arw-low must be less than arw-high"));
+        }
         if self.td_s.is_finite() {
             Ok(())
         } else {
@@ -154,6 +180,17 @@ impl Tuning {
                 "k must be greater than 0 in the parallel form, or td 0",
             ))
         }
+    }
+}
+
+/// What a gain of the feedforward in parts of the spans is in units of output per unit of feedforward: `FF_SCALE` of the
+/// Foundation Fieldbus block. The zero of its scale only shifts the output, which the integral takes up.
+fn ff_scale(p: &Parameters<'_>) -> f64 {
+    let span = value(p, table::FF_SPAN);
+    if span > 0.0 {
+        (p.of(table::OUT_HIGH) - p.of(table::OUT_LOW)) / span
+    } else {
+        1.0
     }
 }
 

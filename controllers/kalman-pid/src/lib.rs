@@ -116,7 +116,7 @@ impl Controller for KalmanPid {
     fn step(state: &mut State, parameters: &Parameters<'_>, cycle: &Cycle, io: &mut Io<'_>) -> Result<(), Fault> {
         let held = block::held(io, OUT);
         let actuator = held.unwrap_or(state.pid.output);
-        let output = match block::take(&mut state.pid, cycle, io, held, block::always)? {
+        let output = match block::take(&mut state.pid, parameters, cycle, io, held, block::always)? {
             Intake::Blind(value) => {
                 state.filter.forget();
                 value

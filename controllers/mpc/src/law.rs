@@ -150,7 +150,7 @@ impl Memory {
                 self.phase = Phase::Following;
                 value
             }
-            (Demand::Automatic, Phase::New | Phase::Following) => {
+            (Demand::Automatic, Phase::New | Phase::Following | Phase::Bypassed) => {
                 self.phase = Phase::Running;
                 self.since_s = t.interval_s;
                 limit(sample.held, t.out_low, t.out_high)

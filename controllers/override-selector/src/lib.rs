@@ -101,7 +101,10 @@ impl Controller for OverrideSelector {
     fn step(pair: &mut Pair, parameters: &Parameters<'_>, cycle: &Cycle, io: &mut Io<'_>) -> Result<(), Fault> {
         let held = block::held(io, OUT);
         let limit_pv = io.read_usable(LIMIT_PV).map(|r| r.value);
-        let output = match (block::take(&mut pair.main, cycle, io, held, block::always)?, limit_pv) {
+        let output = match (
+            block::take(&mut pair.main, parameters, cycle, io, held, block::always)?,
+            limit_pv,
+        ) {
             (Intake::Blind(value), _) => {
                 pair.limit.follow_blind(value);
                 value

@@ -4,7 +4,7 @@
 
 pub mod law;
 
-use bumpless_isa::{Memory, block};
+use bumpless_isa::block::{self, Block};
 use bumpless_sdk::prelude::*;
 
 /// The controller.
@@ -18,22 +18,22 @@ impl Controller for Pid {
         "PID controller, ISA standard form, with external reset",
     );
 
-    type State = Memory;
+    type State = Block;
 
-    fn start(parameters: &Parameters<'_>, track: &Track<'_>) -> Result<Memory, Fault> {
-        block::start(parameters, track)
+    fn start(parameters: &Parameters<'_>, track: &Track<'_>) -> Result<Block, Fault> {
+        Ok(block::start(parameters, track)?.into())
     }
 
-    fn step(memory: &mut Memory, parameters: &Parameters<'_>, cycle: &Cycle, io: &mut Io<'_>) -> Result<(), Fault> {
-        block::step(memory, parameters, cycle, io, law::elapsed_s)
+    fn step(state: &mut Block, parameters: &Parameters<'_>, cycle: &Cycle, io: &mut Io<'_>) -> Result<(), Fault> {
+        block::step(state, parameters, cycle, io, law::elapsed_s)
     }
 
-    fn retune(memory: &mut Memory, old: &Parameters<'_>, new: &Parameters<'_>, _: &Track<'_>) -> Result<(), Fault> {
-        block::retune(memory, old, new)
+    fn retune(state: &mut Block, old: &Parameters<'_>, new: &Parameters<'_>, _: &Track<'_>) -> Result<(), Fault> {
+        block::retune(&mut state.memory, old, new)
     }
 
-    fn adopt(from: &Origin<'_>, parameters: &Parameters<'_>, _: &Track<'_>) -> Result<Option<Memory>, Fault> {
-        block::adopt(from, parameters)
+    fn adopt(from: &Origin<'_>, parameters: &Parameters<'_>, _: &Track<'_>) -> Result<Option<Block>, Fault> {
+        block::adopt_block(from, parameters)
     }
 }
 

@@ -86,7 +86,7 @@ impl Controller for Smith {
         // The model sees the actuator in manual and without a measurement too, so it is always up to date.
         let actuator = held.unwrap_or(state.pid.output);
         let ahead = state.predictor.step(&model(parameters), actuator, cycle.dt_s());
-        let output = match block::take(&mut state.pid, cycle, io, held, block::always)? {
+        let output = match block::take(&mut state.pid, parameters, cycle, io, held, block::always)? {
             Intake::Blind(value) => value,
             Intake::Seen(mut sample, _) => {
                 let measured = sample.pv;

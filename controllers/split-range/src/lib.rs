@@ -93,7 +93,7 @@ impl Controller for SplitRange {
         let curves = curves(parameters);
         let held = state.actuators.held([block::held(io, OUT), block::held(io, OUT_B)]);
         let u_held = curves.back(state.actuators.meant(held), state.pid.output);
-        let (u, demand) = match block::take(&mut state.pid, cycle, io, Some(u_held), block::always)? {
+        let (u, demand) = match block::take(&mut state.pid, parameters, cycle, io, Some(u_held), block::always)? {
             Intake::Blind(u) => (u, Demand::Follow(u)),
             Intake::Seen(sample, _) => {
                 let tuning = Tuning::of(parameters);

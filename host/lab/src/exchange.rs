@@ -11,7 +11,7 @@ use crate::{limits::CALL_NS_MAX, seat::Running, world::World};
 impl World<'_> {
     /// A change of revision: both components step on the same frame at the owner, and the bump decides.
     pub(crate) fn revise(&mut self, of: usize, owner: usize, mut running: Running, command: CommandId, revision: u64) {
-        let old_step = self.step(of, running.revision, &running.frame, &running.state);
+        let old_step = self.step(of, owner, running.revision, &running.frame, &running.state);
         let by = running.sample.owner.clone();
         match self.try_revision(of, &running, revision, old_step.as_ref().ok()) {
             Ok(tried) => {

@@ -174,9 +174,12 @@ pub struct LoopPlan {
     /// Bounds within which a host runs it.
     #[serde(default)]
     pub policy: Policy,
-    /// How the replica that steps is chosen.
-    #[serde(default = "local")]
+    /// How the replica that steps is chosen, by its name: `round-robin`, `vote(3)`.
+    #[serde(default = "local", with = "strategy_name")]
     pub strategy: Strategy,
+    /// Topics whose messages its controller receives from other loops.
+    #[serde(default)]
+    pub listens: Vec<String>,
     /// The input port that the indices are made of; `pv`, or the only required input.
     #[serde(default)]
     pub measured: Option<String>,
@@ -368,6 +371,17 @@ pub enum Event {
         /// How long, in s.
         for_s: f64,
     },
+    /// A host's steps go wrong: their first output is off.
+    Wrong {
+        /// When, in s.
+        at_s: f64,
+        /// The host, or `owner`.
+        host: String,
+        /// By how much, in the output's unit.
+        by: f64,
+        /// How long, in s.
+        for_s: f64,
+    },
     /// The load of a host's cores changes.
     Load {
         /// When, in s.
@@ -412,6 +426,7 @@ impl Event {
             | Self::Off { at_s, .. }
             | Self::On { at_s, .. }
             | Self::Pause { at_s, .. }
+            | Self::Wrong { at_s, .. }
             | Self::Load { at_s, .. }
             | Self::Mode { at_s, .. }
             | Self::Output { at_s, .. } => *at_s,
@@ -424,6 +439,7 @@ impl Event {
             | Self::Off { host, .. }
             | Self::On { host, .. }
             | Self::Pause { host, .. }
+            | Self::Wrong { host, .. }
             | Self::Load { host, .. } => Some(host),
             _ => None,
         }
@@ -568,6 +584,7 @@ impl Experiment {
 }
 
 mod check;
+mod strategy_name;
 
 #[cfg(test)]
 mod tests;

@@ -57,9 +57,15 @@ impl World<'_> {
 
     pub(crate) fn arrived(&mut self, values: &[(usize, f64, u64)]) {
         for &(signal, value, at_ns) in values {
+            let range = self.instruments.get(signal).and_then(|i| i.range);
+            // At an end of its range an instrument may hide more: usable with care, as on a live host.
+            let at_end = range.is_some_and(|(low, high)| value <= low || value >= high);
             if let Some(known) = self.image.get_mut(signal) {
                 known.reading = if value.is_finite() {
-                    Reading::good(value, at_ns)
+                    Reading {
+                        quality: if at_end { Quality::Uncertain } else { Quality::Good },
+                        ..Reading::good(value, at_ns)
+                    }
                 } else {
                     Reading::missing(NoData::OutOfRange, known.reading.last_good, at_ns)
                 };

@@ -96,6 +96,14 @@ impl World<'_> {
                     h.paused_until_ns = until_ns;
                 }
             }
+            Event::Wrong { host, by, for_s, .. } => {
+                let host = self.target(host);
+                let until_ns = self.now_ns + ns(*for_s);
+                self.note(format!("{}'s steps are off by {by} for {for_s} s", self.hosts[host].id));
+                if let Some(h) = self.hosts.get_mut(host) {
+                    h.wrong = Some((until_ns, *by));
+                }
+            }
             Event::Load { host, cpu, step, .. } => {
                 let host = self.target(host);
                 self.note(format!("{} is loaded to {} %", self.hosts[host].id, cpu * 100.0));

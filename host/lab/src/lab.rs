@@ -456,7 +456,7 @@ impl Lab {
             strategy: plan.strategy,
             replicas: bumpless_core::limits::REPLICAS_MAX as u8,
             limits,
-            listens: Vec::new(),
+            listens: plan.listens.clone(),
             fallback: None,
             fallback_parameters: std::collections::BTreeMap::new(),
             prefer: Vec::new(),

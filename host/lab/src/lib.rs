@@ -27,7 +27,9 @@ pub mod variant;
 mod exchange;
 mod field;
 mod happening;
+mod home;
 mod seat;
+mod vote;
 mod world;
 
 pub use error::Error;

@@ -30,7 +30,7 @@ const fn figure(key: &'static str, name: &'static str, unit: &'static str, text:
 }
 
 /// Every figure, in the order of tables.
-pub const FIGURES: [Figure; 27] = [
+pub const FIGURES: [Figure; 28] = [
     figure("iae", "IAE", "u s", "integral of the absolute error"),
     figure("ise", "ISE", "u² s", "integral of the squared error"),
     figure("itae", "ITAE", "u s²", "integral of time times absolute error"),
@@ -111,6 +111,7 @@ pub const FIGURES: [Figure; 27] = [
         "replicas that were silent, so that the next one was asked",
     ),
     figure("faults", "faults", "", "cycles without a good step"),
+    figure("dissents", "dissents", "", "answers against the majority of a vote"),
     figure(
         "bump",
         "bump",
@@ -218,6 +219,7 @@ pub(crate) struct Meter {
     trace: Option<Trace>,
     pub(crate) hedged: u64,
     pub(crate) faults: u64,
+    pub(crate) dissents: u64,
     pub(crate) limited: u64,
     pub(crate) bump_percent: Option<f64>,
 }
@@ -265,6 +267,7 @@ impl Meter {
             }),
             hedged: 0,
             faults: 0,
+            dissents: 0,
             limited: 0,
             bump_percent: None,
         }
@@ -394,6 +397,7 @@ impl Meter {
         put("gap", (self.gap.n > 0).then_some(self.gap.most));
         put("hedged", Some(self.hedged as f64));
         put("faults", Some(self.faults as f64));
+        put("dissents", (self.dissents > 0).then_some(self.dissents as f64));
         put("limited", Some(self.limited as f64));
         put("bump", self.bump_percent);
         (figures, self.trace.map(|t| t.rows))

@@ -24,7 +24,26 @@ struct Row {
     setpoint: Option<f64>,
     measurement: Option<f64>,
     #[serde(default)]
+    readings: Vec<Seen>,
+    #[serde(default)]
     outputs: BTreeMap<String, Option<f64>>,
+}
+
+/// What the step saw of one port.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+struct Seen {
+    port: String,
+    quality: String,
+}
+
+impl Row {
+    /// What was measured. Where the reading of `pv` (else of the first port) was bad, the row has the last good value, which
+    /// is none of that moment.
+    fn measured(&self) -> Option<f64> {
+        let seen = self.readings.iter().find(|r| r.port == "pv");
+        let seen = seen.or_else(|| self.readings.first());
+        self.measurement.filter(|_| seen.is_none_or(|r| r.quality != "bad"))
+    }
 }
 
 /// One recorded cycle.
@@ -92,7 +111,7 @@ impl Window {
             moments.push(Moment {
                 t_s,
                 setpoint: number(row.setpoint),
-                measurement: number(row.measurement),
+                measurement: number(row.measured()),
                 output: number(row.outputs.values().next().copied().flatten()),
             });
         }
@@ -124,16 +143,11 @@ impl Window {
     #[must_use]
     pub fn fit(&self) -> Option<Fit> {
         let h = self.period_s();
-        let good: Vec<&Moment> = self
-            .moments
-            .iter()
-            .filter(|m| m.measurement.is_finite() && m.output.is_finite())
-            .collect();
-        let n = good.len();
+        let grid = Grid::of(&self.moments, h);
         // Dead times up to a quarter of the window, in steps of a cycle, at most 200.
-        let most = (n / 4).min(200);
+        let most = (grid.slots.len() / 4).min(DEAD_MAX);
         (0..=most)
-            .filter_map(|dead| fit_at(&good, dead, h))
+            .filter_map(|dead| fit_at(&grid, dead, h))
             // Where a longer dead time says no more (an input that repeats itself), the shorter one is meant.
             .reduce(|best, next| {
                 if next.explained > best.explained + 1e-6 {
@@ -146,14 +160,83 @@ impl Window {
     }
 }
 
-/// y(k+1) = a·y(k) + b·u(k−dead) + c by least squares; 0 < a < 1 is a first-order lag.
-fn fit_at(m: &[&Moment], dead: usize, h: f64) -> Option<Fit> {
+/// Longest dead time that is tried, in cycles.
+const DEAD_MAX: usize = 200;
+/// A longer gap in the record, in cycles, is a break: what the actuator held meanwhile is not known.
+const GAP_MAX: usize = 20;
+
+/// One period of the window: what was measured and what the actuator held, as far as they are known.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+struct Slot {
+    measurement: Option<f64>,
+    output: Option<f64>,
+}
+
+/// The window on an even grid of its period. A cycle that was lost leaves a slot without a measurement; its actuator held on.
+#[derive(Debug, Clone, PartialEq)]
+struct Grid {
+    slots: Vec<Slot>,
+}
+
+impl Grid {
+    fn of(moments: &[Moment], h: f64) -> Self {
+        let number = |v: f64| Some(v).filter(|v| v.is_finite());
+        let mut slots: Vec<Slot> = Vec::with_capacity(moments.len());
+        let mut last_s: Option<f64> = None;
+        for m in moments {
+            let steps = last_s.map_or(1, |last_s| ((m.t_s - last_s) / h).round() as usize);
+            last_s = Some(m.t_s);
+            if steps == 0 {
+                // Two cycles within half a period: the later one says what the actuator holds.
+                if let Some(slot) = slots.last_mut() {
+                    slot.output = number(m.output).or(slot.output);
+                    slot.measurement = slot.measurement.or(number(m.measurement));
+                }
+                continue;
+            }
+            let held = slots.last().and_then(|slot| slot.output);
+            let (missing, between) = if steps <= GAP_MAX {
+                (steps - 1, held)
+            } else {
+                (DEAD_MAX + 1, None)
+            };
+            slots.extend(std::iter::repeat_n(
+                Slot {
+                    measurement: None,
+                    output: between,
+                },
+                missing,
+            ));
+            let held = if steps <= GAP_MAX { held } else { None };
+            slots.push(Slot {
+                measurement: number(m.measurement),
+                output: number(m.output).or(held),
+            });
+        }
+        Self { slots }
+    }
+
+    fn measurement(&self, k: usize) -> Option<f64> {
+        self.slots.get(k)?.measurement
+    }
+
+    fn output(&self, k: usize) -> Option<f64> {
+        self.slots.get(k)?.output
+    }
+}
+
+/// y(k+1) = a·y(k) + b·u(k−dead) + c by least squares over all k where the three are known; 0 < a < 1 is a first-order lag.
+fn fit_at(grid: &Grid, dead: usize, h: f64) -> Option<Fit> {
     let mut normal = [[0.0; 4]; 3];
-    for k in dead..m.len().saturating_sub(1) {
-        let x = [m.get(k)?.measurement, m.get(k - dead)?.output, 1.0];
-        let y = m.get(k + 1)?.measurement;
+    let last = grid.slots.len().saturating_sub(1);
+    for k in dead..last {
+        let known = (grid.measurement(k), grid.output(k - dead), grid.measurement(k + 1));
+        let (Some(y), Some(u), Some(next)) = known else {
+            continue;
+        };
+        let x = [y, u, 1.0];
         for (row, a) in normal.iter_mut().zip(x) {
-            for (cell, b) in row.iter_mut().zip(x.into_iter().chain([y])) {
+            for (cell, b) in row.iter_mut().zip(x.into_iter().chain([next])) {
                 *cell += a * b;
             }
         }
@@ -162,13 +245,19 @@ fn fit_at(m: &[&Moment], dead: usize, h: f64) -> Option<Fit> {
     if !(a > 0.0 && a < 1.0 - 1e-9 && b != 0.0) {
         return None;
     }
-    let mean = m.iter().map(|x| x.measurement).sum::<f64>() / m.len() as f64;
-    let (mut y, mut missed, mut all) = (m.get(dead)?.measurement, 0.0, 0.0);
-    for k in dead..m.len().saturating_sub(1) {
-        y = a * y + b * m.get(k - dead)?.output + c;
-        let truth = m.get(k + 1)?.measurement;
-        missed += (truth - y).powi(2);
-        all += (truth - mean).powi(2);
+    let measured = || grid.slots.iter().filter_map(|s| s.measurement);
+    let mean = measured().sum::<f64>() / measured().count() as f64;
+    // A free run from the first measurement on; after a break it begins anew.
+    let (mut y, mut missed, mut all) = (None, 0.0, 0.0);
+    for k in dead..last {
+        y = match (y.or(grid.measurement(k)), grid.output(k - dead)) {
+            (Some(y), Some(u)) => Some(a * y + b * u + c),
+            _ => None,
+        };
+        if let (Some(y), Some(truth)) = (y, grid.measurement(k + 1)) {
+            missed += (truth - y).powi(2);
+            all += (truth - mean).powi(2);
+        }
     }
     (all > 0.0).then(|| Fit {
         gain: b / (1.0 - a),
@@ -305,6 +394,40 @@ mod tests {
     }
 
     #[test]
+    fn cycles_that_are_missing_or_late_do_not_bend_the_fit() {
+        let near = |fit: Fit| {
+            assert!(
+                (fit.gain - 2.0).abs() < 1e-6 && (fit.tau_s - 5.0).abs() < 1e-6,
+                "{fit:?}"
+            );
+            assert!((fit.dead_time_s - 1.0).abs() < 1e-9 && fit.explained > 0.999, "{fit:?}");
+        };
+        // Every fifth measurement is bad; every seventh cycle was lost, while the actuator held.
+        let mut gaps = window();
+        let mut n = 0;
+        gaps.moments.retain_mut(|m| {
+            n += 1;
+            if n % 5 == 0 {
+                m.measurement = f64::NAN;
+            }
+            n % 7 != 0 || (n - 1) % 20 == 0
+        });
+        near(gaps.fit().unwrap());
+        // The clock of the record trembles.
+        let mut late = window();
+        for (i, m) in late.moments.iter_mut().enumerate() {
+            m.t_s += if i % 3 == 0 { 0.08 } else { 0.0 };
+        }
+        near(late.fit().unwrap());
+        // Nobody knows what happened in an hour without a record.
+        let mut hour = window();
+        for m in hour.moments.iter_mut().skip(100) {
+            m.t_s += 3600.0;
+        }
+        near(hour.fit().unwrap());
+    }
+
+    #[test]
     fn a_window_that_does_not_move_fits_nothing() {
         let mut still = window();
         for m in &mut still.moments {
@@ -317,7 +440,8 @@ mod tests {
     fn what_was_measured_comes_again() {
         let json = br#"{"loop":"l","records":[
             {"at_unix_us":1000000,"setpoint":1.0,"measurement":5.0,"outputs":{"out":2.0}},
-            {"at_unix_us":1500000,"setpoint":1.0,"measurement":null,"outputs":{"out":2.5}},
+            {"at_unix_us":1500000,"setpoint":1.0,"measurement":5.0,"outputs":{"out":2.5},
+             "readings":[{"port":"pv","quality":"bad","value":5.0},{"port":"out","quality":"good","value":2.0}]},
             {"at_unix_us":2000000,"setpoint":1.0,"measurement":7.0,"outputs":{"out":3.0}}],"more":false,"unread":0}"#;
         let window = Window::parse(json, "x").unwrap();
         assert!((window.duration_s() - 1.0).abs() < 1e-9 && (window.period_s() - 0.5).abs() < 1e-9);

@@ -291,6 +291,7 @@ mod tests {
             at: vec![Setting {
                 title: "gain, K".to_owned(),
                 label: number.to_string(),
+                of_law: false,
                 number: Some(number),
             }],
             component: "pid".to_owned(),
@@ -362,6 +363,6 @@ mod tests {
         assert_eq!(html(&outcome()).unwrap(), page);
         let json: serde_json::Value = serde_json::from_str(&fs::read_to_string(&files.json).unwrap()).unwrap();
         assert_eq!(json["variants"][0]["loops"]["flow"]["iae"]["mean"], 6.0);
-        assert_eq!(outcome().winner("iae").unwrap().case, "plus");
+        assert_eq!(outcome().winner("iae", None).unwrap().title(), "plus");
     }
 }

@@ -179,16 +179,58 @@ impl VariantResult {
     }
 }
 
-impl Outcome {
-    /// The case with the least mean of a figure of the first loop, over all points of the sweeps; none where no run ended.
+/// A law of an experiment: a case with the points of those sweeps that set its controller, in all circumstances.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Contender<'a> {
+    /// Its results, one per point of the sweeps that set no controller.
+    pub results: Vec<&'a VariantResult>,
+    /// Mean of the figure over them, each with the same weight.
+    pub score: f64,
+}
+
+impl Contender<'_> {
+    /// The case with the law's own sweep points, for people.
     #[must_use]
-    pub fn winner(&self, key: &str) -> Option<&VariantResult> {
-        let score = |v: &&VariantResult| v.summary(0, key).map(|s| s.mean);
-        self.variants
-            .iter()
-            .filter(|v| v.runs.iter().all(|r| r.failed.is_none()))
-            .filter(|v| score(v).is_some())
-            .min_by(|a, b| score(a).unwrap_or(f64::MAX).total_cmp(&score(b).unwrap_or(f64::MAX)))
+    pub fn title(&self) -> String {
+        self.results.first().map_or_else(String::new, |v| {
+            let own = v.at.iter().filter(|s| s.of_law);
+            let own: Vec<String> = own.map(|s| format!("{} = {}", s.title, s.label)).collect();
+            if own.is_empty() {
+                v.case.clone()
+            } else {
+                format!("{}, {}", v.case, own.join(", "))
+            }
+        })
+    }
+}
+
+impl Outcome {
+    /// The law with the least mean of a figure of the first loop. Each law counts with all circumstances that the sweeps put
+    /// it in, so that none wins by the easiest of them; one with a run that failed, or without the figure somewhere, counts
+    /// not at all. With a `case` only that one's laws count. None where nothing is left.
+    #[must_use]
+    pub fn winner(&self, key: &str, case: Option<&str>) -> Option<Contender<'_>> {
+        let same_law = |a: &VariantResult, b: &VariantResult| {
+            let own = |v: &VariantResult| v.at.iter().filter(|s| s.of_law).cloned().collect::<Vec<_>>();
+            a.case == b.case && own(a) == own(b)
+        };
+        let mut laws: Vec<Vec<&VariantResult>> = Vec::new();
+        for v in self.variants.iter().filter(|v| case.is_none_or(|case| v.case == case)) {
+            match laws.iter_mut().find(|law| law.iter().any(|other| same_law(other, v))) {
+                Some(law) => law.push(v),
+                None => laws.push(vec![v]),
+            }
+        }
+        let scored = laws.into_iter().filter_map(|results| {
+            let means = results.iter().map(|v| {
+                let ended = v.runs.iter().all(|r| r.failed.is_none());
+                v.summary(0, key).filter(|_| ended).map(|s| s.mean)
+            });
+            let means = means.collect::<Option<Vec<f64>>>()?;
+            let score = means.iter().sum::<f64>() / means.len() as f64;
+            Some(Contender { results, score })
+        });
+        scored.min_by(|a, b| a.score.total_cmp(&b.score))
     }
 }
 
@@ -196,6 +238,77 @@ impl Outcome {
 mod tests {
     #![allow(clippy::unwrap_used, reason = "tests")]
     use super::*;
+
+    fn variant(case: &str, at: &[(&str, &str, bool)], iae: &[Option<f64>]) -> VariantResult {
+        let settings = at.iter().map(|(title, label, of_law)| Setting {
+            title: (*title).to_owned(),
+            label: (*label).to_owned(),
+            number: None,
+            of_law: *of_law,
+        });
+        let runs = (1..).zip(iae).map(|(seed, iae)| RunResult {
+            seed,
+            loops: vec![LoopResult {
+                name: "l".to_owned(),
+                figures: iae.iter().map(|iae| ("iae".to_owned(), *iae)).collect(),
+                trace: Vec::new(),
+            }],
+            notes: Vec::new(),
+            notes_dropped: 0,
+            hosts: Vec::new(),
+            failed: iae.is_none().then(|| "it stopped".to_owned()),
+        });
+        VariantResult {
+            case: case.to_owned(),
+            at: settings.collect(),
+            component: case.to_owned(),
+            runs: runs.collect(),
+        }
+    }
+
+    fn outcome(variants: Vec<VariantResult>) -> Outcome {
+        Outcome {
+            name: "t".to_owned(),
+            text: String::new(),
+            loops: vec!["l".to_owned()],
+            units: Vec::new(),
+            variants,
+            duration_s: 1.0,
+        }
+    }
+
+    #[test]
+    fn the_best_law_wins_and_not_the_easiest_point() {
+        let (none, much) = (("loss", "none", false), ("loss", "half", false));
+        let both = outcome(vec![
+            variant("pid", &[none], &[Some(1.0), Some(1.2)]),
+            variant("pidplus", &[none], &[Some(1.5), Some(1.5)]),
+            variant("pid", &[much], &[Some(9.0), Some(11.0)]),
+            variant("pidplus", &[much], &[Some(2.0), Some(2.0)]),
+        ]);
+        let winner = both.winner("iae", None).unwrap();
+        assert_eq!((winner.title().as_str(), winner.results.len()), ("pidplus", 2));
+        assert!((winner.score - 1.75).abs() < 1e-12);
+        assert_eq!(both.winner("iae", Some("pid")).unwrap().title(), "pid");
+        assert_eq!(both.winner("iae", Some("nobody")), None);
+        assert_eq!(both.winner("settling", None), None);
+    }
+
+    #[test]
+    fn a_sweep_over_a_parameter_makes_laws_of_its_own_and_a_failed_run_counts_a_law_out() {
+        let ti = |label| ("controller.parameters.ti", label, true);
+        let (none, much) = (("loss", "none", false), ("loss", "half", false));
+        let tuned = outcome(vec![
+            variant("pid", &[ti("1"), none], &[Some(1.0)]),
+            variant("pid", &[ti("1"), much], &[Some(8.0)]),
+            variant("pid", &[ti("2"), none], &[Some(2.0)]),
+            variant("pid", &[ti("2"), much], &[Some(3.0)]),
+            variant("pid", &[ti("3"), none], &[Some(0.1)]),
+            variant("pid", &[ti("3"), much], &[None]),
+        ]);
+        let winner = tuned.winner("iae", None).unwrap();
+        assert_eq!(winner.title(), "pid, controller.parameters.ti = 2");
+    }
 
     #[test]
     fn a_summary_is_what_statistics_say() {

@@ -13,6 +13,7 @@ use bumpless_core::{
     protocol::{Answer, Sample},
     seat::{self, Ask, Attempts, Base, Conclusion, Standing, Stepped},
     select::{self, Candidate, Health},
+    vote::{Ballot, Judged},
 };
 use bumpless_engine::{Instance, Origin};
 
@@ -21,6 +22,7 @@ use crate::{
     experiment::HostPlan,
     limits::CALL_NS_MAX,
     network::{Delay, Dice},
+    vote::{self, Late},
     world::{What, World},
 };
 
@@ -81,6 +83,10 @@ pub(crate) struct Seat {
     pub(crate) last: Option<Arc<Record>>,
     inflight: Option<Arc<Record>>,
     pub(crate) running: Option<Running>,
+    /// What the last vote decided, while answers may still come.
+    pub(crate) late: Option<Late>,
+    /// Answers that came after their vote; they count in the next one.
+    pub(crate) judged: Vec<Judged>,
 }
 
 /// One host.
@@ -93,7 +99,9 @@ pub(crate) struct Host {
     dice: Dice,
     choices: Dice,
     pub(crate) seats: Vec<Seat>,
-    health: HashMap<usize, Health>,
+    pub(crate) health: HashMap<usize, Health>,
+    /// Until when its steps are off in their first output, and by how much.
+    pub(crate) wrong: Option<(u64, f64)>,
 }
 
 impl Host {
@@ -108,6 +116,7 @@ impl Host {
             step: Delay::default(),
             seats: (0..loops).map(|_| Seat::default()).collect(),
             health: HashMap::new(),
+            wrong: None,
         }
     }
 
@@ -141,6 +150,9 @@ pub(crate) struct Running {
     pub(crate) standing: Standing,
     pub(crate) events: Vec<Event>,
     pub(crate) attempts: Attempts,
+    pub(crate) ballot: Option<Ballot>,
+    pub(crate) redundancy: Redundancy,
+    pub(crate) hedge_ns: u64,
     pub(crate) asked: Vec<(usize, u64)>,
     pub(crate) fault: Option<Fault>,
     pub(crate) revision: usize,
@@ -150,7 +162,7 @@ pub(crate) struct Running {
 }
 
 impl Running {
-    fn cycle(&self) -> (u64, u64) {
+    pub(crate) const fn cycle(&self) -> (u64, u64) {
         (self.sample.term, self.sample.seq)
     }
 }
@@ -224,6 +236,7 @@ impl World<'_> {
             (Ok(_), None) => None,
         };
         let (period_ns, strategy) = (held.spec.period_ns, held.spec.strategy);
+        let (redundancy, ballot) = vote::redundancy(&held.spec, &candidates, &sample.owner, base.as_deref());
         let here_at_ns = now_ns + (sample.left_ns as f64 * HERE_PART) as u64;
         let hedge_ns = (period_ns as f64 * held.spec.policy.hedge_part) as u64;
         let order: Vec<&Candidate> = if fault.is_some() || standing.revise.is_some() {
@@ -246,6 +259,9 @@ impl World<'_> {
                 hedge_ns,
                 here_at_ns,
             ),
+            ballot: None,
+            redundancy,
+            hedge_ns,
             state: state.unwrap_or_else(|_| Arc::from([])),
             give_up_at_ns: now_ns + sample.left_ns / 10 * 9,
             sample,
@@ -262,7 +278,10 @@ impl World<'_> {
         match (running.standing.revise, fault) {
             (_, Some(fault)) => self.conclude(of, owner, running, Err(fault)),
             (Some((command, revision)), None) => self.revise(of, owner, running, command, revision),
-            (None, None) => self.advance(of, owner, running),
+            (None, None) => match ballot {
+                Some(ballot) => self.open_ballot(of, owner, running, ballot),
+                None => self.advance(of, owner, running),
+            },
         }
     }
 
@@ -314,7 +333,7 @@ impl World<'_> {
             }
             Ask::Here => {
                 let (term, seq) = running.cycle();
-                let result = self.step(of, running.revision, &running.frame, &running.state);
+                let result = self.step(of, owner, running.revision, &running.frame, &running.state);
                 let took_ns = self.step_ns(owner);
                 if took_ns == 0 {
                     return self.stepped(of, owner, owner, running, result);
@@ -346,7 +365,7 @@ impl World<'_> {
         }
     }
 
-    fn wait(&mut self, of: usize, owner: usize, mut running: Running, until_ns: u64) {
+    pub(crate) fn wait(&mut self, of: usize, owner: usize, mut running: Running, until_ns: u64) {
         running.next_at_ns = until_ns;
         if let Some(slot) = self.running(of, owner) {
             *slot = Some(running);
@@ -373,6 +392,9 @@ impl World<'_> {
             .running(of, owner)
             .and_then(|slot| slot.take_if(|r| r.next_at_ns == at_ns));
         let Some(mut running) = taken else { return };
+        if running.ballot.is_some() {
+            return self.ballot_due(of, owner, running);
+        }
         if let Some(&(host, asked_ns)) = running.asked.last() {
             let replica = self.hosts.get(host).map(|h| h.id.clone());
             if let Some(h) = self.hosts.get_mut(owner) {
@@ -383,15 +405,29 @@ impl World<'_> {
         self.advance(of, owner, running);
     }
 
-    fn step_ns(&mut self, host: usize) -> u64 {
+    pub(crate) fn step_ns(&mut self, host: usize) -> u64 {
         self.hosts.get_mut(host).map_or(0, |h| h.step.draw_ns(&mut h.dice))
     }
 
-    pub(crate) fn step(&mut self, of: usize, revision: usize, frame: &Frame, state: &[u8]) -> Result<Effects, Fault> {
-        match self.loops.get_mut(of).and_then(|l| l.held.get_mut(revision)) {
-            Some(held) => held.instance.step(frame, state, CALL_NS_MAX),
-            None => Err(Fault::Failed("the revision is not held".to_owned())),
+    /// A step on a host. One whose steps go wrong does so in its first write.
+    pub(crate) fn step(
+        &mut self,
+        of: usize,
+        host: usize,
+        revision: usize,
+        frame: &Frame,
+        state: &[u8],
+    ) -> Result<Effects, Fault> {
+        let held = self.loops.get_mut(of).and_then(|l| l.held.get_mut(revision));
+        let held = held.ok_or_else(|| Fault::Failed("the revision is not held".to_owned()))?;
+        let mut effects = held.instance.step(frame, state, CALL_NS_MAX)?;
+        let wrong = self.hosts.get(host).and_then(|h| h.wrong);
+        if let Some((_, by)) = wrong.filter(|(until_ns, _)| self.now_ns < *until_ns)
+            && let Some((_, value)) = effects.writes.first_mut()
+        {
+            *value += by;
         }
+        Ok(effects)
     }
 
     /// A replica is asked for a step. What it sees is the owner's running cycle: were that gone, nobody would want the answer.
@@ -413,7 +449,7 @@ impl World<'_> {
         else {
             return;
         };
-        let result = self.step(of, revision, &frame, &state);
+        let result = self.step(of, host, revision, &frame, &state);
         let done_ns = self.now_ns + self.step_ns(host);
         // The answer leaves when the step is done; its way is drawn now, which is the same in all but the order of dice.
         if let Some(at_ns) = self.passes(host, owner) {
@@ -457,11 +493,16 @@ impl World<'_> {
         let taken = self
             .running(of, owner)
             .and_then(|slot| slot.take_if(|r| r.cycle() == cycle));
-        let Some(running) = taken else { return };
+        let Some(running) = taken else {
+            return self.judge_late(of, owner, host, cycle, result);
+        };
         let asked_ns = running.asked.iter().find(|(h, _)| *h == host).map(|(_, at_ns)| *at_ns);
         let now_ns = self.now_ns;
         if let (Some(asked_ns), Some(h)) = (asked_ns, self.hosts.get_mut(owner)) {
             h.health.entry(host).or_default().answered(now_ns - asked_ns);
+        }
+        if running.ballot.is_some() {
+            return self.voted(of, owner, host, running, result);
         }
         self.stepped(of, owner, host, running, result);
     }
@@ -516,7 +557,7 @@ impl World<'_> {
             standing: running.standing,
             events: running.events,
             probation: None,
-            redundancy: Redundancy::default(),
+            redundancy: running.redundancy,
             step,
             cycle_ns: now_ns - running.started_ns,
         });
@@ -531,46 +572,6 @@ impl World<'_> {
                 self.commit(of, record);
             } else {
                 self.at(at_ns, What::Commit(of, Box::new(record)));
-            }
-        }
-    }
-
-    /// A commit is at the home.
-    pub(crate) fn commit(&mut self, of: usize, record: Record) {
-        let now_ns = self.now_ns;
-        let Some(l) = self.loops.get_mut(of) else { return };
-        if l.desk.check(&record).is_err() {
-            return;
-        }
-        let Some(revision) = l.held.iter().position(|h| h.spec.revision == record.revision) else {
-            return;
-        };
-        self.send_outputs(of, &record, revision);
-        for event in &record.events {
-            if let Event::TookOver { from: Some(from) } = event {
-                self.note(format!(
-                    "{}: {} takes over from {from}",
-                    self.loop_name(of),
-                    record.owner
-                ));
-            }
-            if let Event::Faulted { replica, fault } = event {
-                self.note(format!("{}: a step on {replica} failed: {fault}", self.loop_name(of)));
-            }
-        }
-        let Some(l) = self.loops.get_mut(of) else { return };
-        let record = l.desk.take(now_ns, record);
-        // Nobody waits for the outcome of a command here; what was taken counts as kept.
-        drop(l.desk.kept(record.position()));
-        if record.revision != l.desk.spec().revision
-            && let Some(held) = l.held.get(revision)
-        {
-            l.desk.revise(now_ns, Arc::clone(&held.spec), 0);
-        }
-        // Everyone hears of it; a host that stands still has it in its inbox when it goes on.
-        for host in self.hosts.iter_mut().filter(|h| h.on) {
-            if let Some(seat) = host.seats.get_mut(of) {
-                seat.last = Some(Arc::clone(&record));
             }
         }
     }

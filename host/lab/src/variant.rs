@@ -19,6 +19,8 @@ pub struct Setting {
     pub label: String,
     /// The value, where it is a number.
     pub number: Option<f64>,
+    /// Does it set a controller or its parameters, so that it belongs to the law and not to its circumstances?
+    pub of_law: bool,
 }
 
 /// One case at one point of the sweeps.
@@ -85,6 +87,7 @@ pub fn variants(experiment: &Experiment, document: &toml::Table, place: &str) ->
                         .as_ref()
                         .and_then(|labels| labels.get(n).cloned())
                         .unwrap_or_else(|| label(value)),
+                    of_law: sets_controller(&sweep.field),
                     number: value.as_float().or_else(|| value.as_integer().map(|i| i as f64)),
                 });
                 next.push((at, table));
@@ -126,6 +129,16 @@ pub fn variants(experiment: &Experiment, document: &toml::Table, place: &str) ->
         }
     }
     Ok(variants)
+}
+
+/// Does a path lead to a controller: the experiment's, or a loop's own?
+fn sets_controller(path: &str) -> bool {
+    let mut words = path.split('.');
+    match words.next() {
+        Some("controller") => true,
+        Some("loop") => words.nth(1) == Some("controller"),
+        _ => false,
+    }
 }
 
 fn check_count(variants: usize, experiment: &Experiment, place: &str) -> Result<(), Error> {

@@ -13,9 +13,7 @@ use std::{
 };
 
 use bumpless_core::{
-    Command, CommandBody, CommandId, Effects, Fault, HostId, NoData, Reading, Record,
-    desk::{Desk, Dispatch},
-    protocol::Sample,
+    Command, CommandBody, CommandId, Effects, Fault, HostId, NoData, Reading, Record, desk::Desk, protocol::Sample,
 };
 use bumpless_io::sim::{Model, SignalRole};
 
@@ -466,49 +464,6 @@ impl<'a> World<'a> {
                     self.at(self.now_ns + every_ns, What::Look(n));
                 }
             }
-        }
-    }
-
-    fn deadline(&mut self, n: usize) {
-        let t_s = self.now_ns as f64 * 1e-9;
-        let wanted = self.plan.loops.get(n).map_or(0.0, |l| setpoint_at(&l.setpoint, t_s));
-        if let Some(l) = self.loops.get_mut(n)
-            && l.wanted.to_bits() != wanted.to_bits()
-        {
-            l.wanted = wanted;
-            self.command(n, CommandBody::Setpoint(wanted));
-        }
-        let Some(l) = self.loops.get(n) else { return };
-        let in_force = l.desk.spec().revision;
-        let readings = l
-            .held
-            .iter()
-            .find(|h| h.spec.revision == in_force)
-            .map(|h| self.readings(n, h));
-        let next = l.desk.waiting_revision();
-        let next = next.and_then(|r| Some((r, self.readings(n, l.held.iter().find(|h| h.spec.revision == r)?))));
-        let now_ns = self.now_ns;
-        let Some(l) = self.loops.get_mut(n) else { return };
-        let fired = l.desk.deadline(now_ns, readings.unwrap_or_default(), next);
-        let jitter_ns = (self.plan.cell.jitter_ms * 1e6 * l.jitter.uniform()) as u64;
-        let next_ns = l.desk.deadline_at_ns() + jitter_ns;
-        self.at(next_ns.max(now_ns + 1), What::Deadline(n));
-        self.dispatch(n, fired.map(|(_, dispatch)| dispatch));
-    }
-
-    /// Sends what the desk wants sent.
-    pub(crate) fn dispatch(&mut self, n: usize, dispatch: Option<Dispatch>) {
-        match dispatch {
-            Some(Dispatch::Send(sample)) => {
-                let overdue_ns = self.loops.get(n).map_or(0, |l| l.desk.due_at_ns());
-                self.at(overdue_ns.max(self.now_ns + 1), What::Overdue(n));
-                let owner = self.host(&sample.owner);
-                if let Some(at_ns) = self.passes(0, owner) {
-                    self.at(at_ns, What::Sample(n, sample));
-                }
-            }
-            Some(Dispatch::Nobody) => self.note(format!("{}: nobody can run the cycle", self.loop_name(n))),
-            None => {}
         }
     }
 

@@ -219,24 +219,39 @@ struct Memory1 {
 
 #[test]
 fn a_state_of_layout_1_is_taken_over() {
-    let values = [
-        2.0, 10.0, 0.0, 10.0, 1.0, 0.0, 0.0, 0.0, 100.0, 0.0, 0.0, 1.0, 50.0, 60.0, 0.0_f64,
-    ];
-    let mut bytes = vec![0xB1, 3];
-    bytes.extend_from_slice(b"pid");
-    bytes.extend_from_slice(&1u32.to_le_bytes());
-    bytes.push(15);
-    bytes.extend(values.iter().flat_map(|v| v.to_le_bytes()));
     let memory = Memory1 {
         phase: bumpless_isa::Phase::Running,
         // output, integral, pv, setpoint, feedforward, derivative, its setpoint, waited
         numbers: [42.0, 40.0, 50.0, 51.0, 0.0, 0.0, 51.0, 0.0],
     };
-    bytes.extend(postcard::to_allocvec(&memory).unwrap());
+    goes_on_from(1, 15, &postcard::to_allocvec(&memory).unwrap());
+}
+
+#[test]
+fn a_state_of_layout_2_is_taken_over() {
+    let mut memory = bumpless_isa::Memory::new(42.0);
+    memory.phase = bumpless_isa::Phase::Running;
+    (memory.integral, memory.pv, memory.setpoint) = (40.0, 50.0, 51.0);
+    memory.derivative_setpoint = 51.0;
+    // Layout 2 had the law's memory alone.
+    goes_on_from(2, 27, &postcard::to_allocvec(&memory).unwrap());
+}
+
+/// A state in an older layout, with its first so many parameters: K 2, Ti 10, an error of 1, an output of 42.
+#[track_caller]
+fn goes_on_from(state_layout: u32, parameters: usize, law: &[u8]) {
+    let mut values: Vec<f64> = Pid::DESCRIPTION.parameters.iter().map(|p| p.default).collect();
+    (values[0], values[1]) = (2.0, 10.0);
+    let mut bytes = vec![0xB1, 3];
+    bytes.extend_from_slice(b"pid");
+    bytes.extend_from_slice(&state_layout.to_le_bytes());
+    bytes.push(u8::try_from(parameters).unwrap());
+    bytes.extend(values.iter().take(parameters).flat_map(|v| v.to_le_bytes()));
+    bytes.extend_from_slice(law);
     let origin = Origin {
         name: "pid",
         version: "0.1.0",
-        state_layout: 1,
+        state_layout,
         bytes: &bytes,
     };
     let defaults: Vec<f64> = Pid::DESCRIPTION.parameters.iter().map(|p| p.default).collect();

@@ -1,6 +1,6 @@
 //! What holds for any numbers: outputs are finite and within their limits, states decode, damage is a fault.
 
-use bumpless_isa::table::{OUT, PARAMETERS, PV};
+use bumpless_isa::table::{BYPASS_ON, OUT, PARAMETERS, PV};
 use bumpless_pid::Pid;
 use bumpless_sdk::{Mode, bench::Bench};
 use proptest::prelude::*;
@@ -18,7 +18,7 @@ fn parameters() -> impl Strategy<Value = Vec<(&'static str, f64)>> {
         .collect();
     rows.prop_map(|mut values| {
         let at = |values: &[(&str, f64)], name| values.iter().position(|(n, _)| *n == name).expect("is in the table");
-        for (low, high) in [("out-low", "out-high"), ("sp-low", "sp-high")] {
+        for (low, high) in [("out-low", "out-high"), ("sp-low", "sp-high"), ("arw-low", "arw-high")] {
             let (low, high) = (at(&values, low), at(&values, high));
             if values[low].1 >= values[high].1 {
                 values[high].1 = values[low].1 + 1.0;
@@ -37,6 +37,7 @@ struct Moment {
     setpoint: f64,
     dt_s: f64,
     manual: bool,
+    bypass: bool,
     held: Option<f64>,
 }
 
@@ -46,13 +47,15 @@ fn moments() -> impl Strategy<Value = Vec<Moment>> {
         -1e5..1e5f64,
         1e-3..100.0f64,
         prop::bool::weighted(0.1),
+        prop::bool::weighted(0.1),
         prop::option::weighted(0.2, -1e4..1e4f64),
     )
-        .prop_map(|(pv, setpoint, dt_s, manual, held)| Moment {
+        .prop_map(|(pv, setpoint, dt_s, manual, bypass, held)| Moment {
             pv,
             setpoint,
             dt_s,
             manual,
+            bypass,
             held,
         });
     prop::collection::vec(moment, 1..80)
@@ -69,6 +72,7 @@ proptest! {
         for m in moments {
             bench.set(PV, m.pv);
             bench.set_setpoint(m.setpoint);
+            bench.set(BYPASS_ON, f64::from(u8::from(m.bypass)));
             bench.set_mode(if m.manual { Mode::Manual } else { Mode::Automatic });
             if let Some(held) = m.held {
                 bench.hold(OUT, held);
@@ -94,7 +98,7 @@ proptest! {
     }
 
     #[test]
-    fn a_damaged_state_is_a_fault_or_a_state_never_a_panic(cut in 0usize..300, at in 0usize..300, byte: u8) {
+    fn a_damaged_state_is_a_fault_or_a_state_never_a_panic(cut in 0usize..450, at in 0usize..450, byte: u8) {
         let mut bench = Bench::<Pid>::start(&[], &[10.0]).expect("starts");
         bench.set(PV, 1.0);
         let mut state = bench.state().to_vec();

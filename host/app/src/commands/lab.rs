@@ -11,7 +11,7 @@ use std::{
 use bumpless_api::types::{Component, Cycles, Shadow, ShadowRequest};
 use bumpless_engine::{Config as EngineConfig, Engine};
 use bumpless_lab::{
-    Experiment, FIGURES, Lab, Library, Options, Outcome, Progress, VariantResult, recorded::Window, report,
+    Experiment, FIGURES, Lab, Library, Options, Outcome, Progress, limits::RECORDED_BYTES_MAX, recorded::Window, report,
 };
 use indicatif::{ProgressBar, ProgressStyle};
 
@@ -25,8 +25,6 @@ use crate::{
 
 /// Records of one answer; the API's own bound.
 const RECORDS_PER_ANSWER: u32 = 1_000;
-/// Answers of one `record`: a million cycles are a day at 10 Hz.
-const ANSWERS_MAX: usize = 1_000;
 /// Figures of the table in the terminal.
 const SHOWN: [&str; 9] = [
     "iae",
@@ -292,13 +290,21 @@ fn finish(json: bool, plan: &Plan, outcome: &Outcome, how: &LabRunArgs) -> Resul
     show::line(&format!("report: {}; tables beside it", files.html.display()))
 }
 
-/// Asks for a window, answer by answer, and writes one file of all of them.
-fn record(client: &Client, json: bool, name: &str, last: &str, output: &Path) -> Result<(), Error> {
+/// Asks for a window, answer by answer, until nothing is left of it. `ask` gets the query, and gives the answer with the size
+/// of its text, in bytes. A window beyond `bytes_max` is refused: the lab could not read its file, and a part of it that
+/// looks like the whole would be worse.
+fn gather(
+    name: &str,
+    last: &str,
+    bytes_max: u64,
+    mut ask: impl FnMut(&str) -> Result<(Cycles, usize), Error>,
+) -> Result<Cycles, Error> {
     let mut whole: Option<Cycles> = None;
     let mut query = format!("last={}", encoded(last));
-    for _ in 0..ANSWERS_MAX {
-        let path = history::path(name, &format!("/cycles?{query}&limit={RECORDS_PER_ANSWER}"));
-        let answer: Cycles = client.get(&path)?.decode()?;
+    let mut bytes = 0;
+    loop {
+        let (answer, size) = ask(&query)?;
+        bytes += size as u64;
         let (more, newest) = (answer.more, answer.records.last().map(|r| r.at_unix_us));
         match &mut whole {
             None => whole = Some(answer),
@@ -308,16 +314,32 @@ fn record(client: &Client, json: bool, name: &str, last: &str, output: &Path) ->
             }
         }
         match newest.filter(|_| more) {
+            Some(_) if bytes > bytes_max => {
+                let so_far = whole.map_or(0, |w| w.records.len());
+                return Err(Error::Usage(format!(
+                    "the last {last} of {name} are more than the {} MB that a file of cycles may have, which {so_far} of them \
+                     fill; ask for less with --last",
+                    bytes_max >> 20
+                )));
+            }
             Some(at_unix_us) => query = format!("from_unix_us={}", at_unix_us + 1),
             None => break,
         }
     }
-    let Some(mut cycles) = whole.filter(|c| c.records.len() > 1) else {
-        return Err(Error::Usage(format!(
-            "{name} has fewer than two recorded cycles in that time"
-        )));
-    };
+    let mut cycles = whole
+        .filter(|c| c.records.len() > 1)
+        .ok_or_else(|| Error::Usage(format!("{name} has fewer than two recorded cycles in that time")))?;
     cycles.more = false;
+    Ok(cycles)
+}
+
+/// Writes one file of a recorded window.
+fn record(client: &Client, json: bool, name: &str, last: &str, output: &Path) -> Result<(), Error> {
+    let cycles = gather(name, last, RECORDED_BYTES_MAX, |query| {
+        let path = history::path(name, &format!("/cycles?{query}&limit={RECORDS_PER_ANSWER}"));
+        let answer = client.get(&path)?;
+        Ok((answer.decode()?, answer.text.len()))
+    })?;
     let text = serde_json::to_string(&cycles).map_err(|e| Error::start("the file of cycles", e))?;
     fs::write(output, &text).map_err(|source| Error::File {
         path: output.to_owned(),
@@ -380,18 +402,16 @@ fn promote(client: &Client, json: bool, file: &Path, wish: &Wish<'_>, how: &LabR
     }
     let (lab, plan) = (lab(how)?, Plan::read(file, how)?);
     let outcome = plan.run(&lab, how, &*stop::on_signals()?)?;
-    let mut matching = outcome
-        .variants
-        .iter()
-        .filter(|v| wish.case.is_none_or(|case| v.case == case));
-    let best: Option<&VariantResult> = match wish.case {
-        None => outcome.winner(wish.by),
-        Some(_) => matching.next(),
-    };
-    let Some(best) = best else {
+    let winner = outcome.winner(wish.by, wish.case);
+    let Some((winner, best)) = winner.and_then(|w| w.results.first().copied().map(|best| (w, best))) else {
         return Err(Error::Usage(match wish.case {
-            Some(case) => format!("{} has no case {case:?}", plan.place),
-            None => format!("no case of {} reached its end with a {}", plan.place, wish.by),
+            Some(case) if outcome.variants.iter().all(|v| v.case != case) => {
+                format!("{} has no case {case:?}", plan.place)
+            }
+            _ => format!(
+                "no case of {} reached its end everywhere with a {}",
+                plan.place, wish.by
+            ),
         }));
     };
     let chosen = lab
@@ -408,7 +428,7 @@ fn promote(client: &Client, json: bool, file: &Path, wish: &Wish<'_>, how: &LabR
         encoded(&format!(
             "from the experiment {}, case {}",
             plan.experiment.name,
-            best.title()
+            winner.title()
         ))
     );
     let (component, _): (Component, String) = components::send(client, &chosen.file, &note, !json)?;
@@ -420,12 +440,13 @@ fn promote(client: &Client, json: bool, file: &Path, wish: &Wish<'_>, how: &LabR
     let answer = client.post(&history::path(wish.name, "/shadows"), &request)?;
     let started: Shadow = answer.decode()?;
     if !json {
-        let mean = best
-            .summary(0, wish.by)
-            .map_or_else(|| "–".to_owned(), |s| report::interval(&s));
+        let mean = match (winner.results.len(), best.summary(0, wish.by)) {
+            (1, Some(s)) => report::interval(&s),
+            (points, _) => format!("{}, the mean of {points} points", report::number(winner.score)),
+        };
         show::line(&format!(
             "{} ({} {mean}) is {}@{}: uploaded, and shadow {} follows {} for {} cycles",
-            best.title(),
+            winner.title(),
             wish.by,
             component.name,
             component.version,
@@ -457,6 +478,47 @@ mod tests {
         assert_eq!(word("2"), toml::Value::Integer(2));
         assert_eq!(word(" 2.5"), toml::Value::Float(2.5));
         assert_eq!(word("direct"), toml::Value::String("direct".to_owned()));
+    }
+
+    #[test]
+    fn a_window_is_gathered_whole_or_refused() {
+        let cycles = |from: u64, more: bool| -> Cycles {
+            let records: Vec<_> = (from..from + 3)
+                .map(|n| {
+                    serde_json::json!({
+                        "loop": "l", "term": 1, "seq": n, "revision": 1, "digest": "", "owner": "a", "stepped_by": "a",
+                        "at_unix_us": n, "dt_ms": 1.0, "mode": "automatic", "setpoint": 1.0, "measurement": 1.0,
+                        "readings": [], "wanted": {}, "outputs": {}, "state_bytes": 0, "faults_in_row": 0,
+                        "probation_cycles_left": null, "applied": [], "events": [], "alarms": [], "messages": [],
+                        "log": [], "step_us": 1.0, "cycle_us": 1.0, "committed_after_us": 1.0,
+                    })
+                })
+                .collect();
+            let answer = serde_json::json!({ "loop": "l", "records": records, "more": more, "unread": 0 });
+            serde_json::from_value(answer).unwrap()
+        };
+        let mut asked = Vec::new();
+        let whole = gather("l", "5m", 1 << 20, |query| {
+            asked.push(query.to_owned());
+            let n = asked.len() as u64;
+            Ok((cycles(3 * n, n < 2_000), 10))
+        })
+        .unwrap();
+        assert_eq!((whole.records.len(), whole.more), (6_000, false));
+        assert_eq!(asked[..2], ["last=5m", "from_unix_us=6"]);
+        let refused = gather("l", "9d", 1 << 20, |_| Ok((cycles(0, true), 1 << 19))).unwrap_err();
+        let said = refused.to_string();
+        assert!(
+            said.contains("the last 9d of l are more than the 1 MB") && said.contains("--last"),
+            "{said}"
+        );
+        let few = gather("l", "1", 1 << 20, |_| {
+            Ok((cycles(0, false), 10)).map(|(mut c, n): (Cycles, usize)| {
+                c.records.truncate(1);
+                (c, n)
+            })
+        });
+        assert!(few.is_err());
     }
 
     #[test]

@@ -272,6 +272,24 @@ fn a_bad_input_follows_its_own_policy_and_is_no_fault_of_the_component() {
 }
 
 #[test]
+fn a_bad_input_may_shed_the_target_to_manual() {
+    let (mut spec, _) = setup();
+    spec.policy.on_bad_input = OnFault::Manual;
+    let standing = settle(Some(&before()), &spec, &sample(vec![]), &[42.0]);
+    let record = conclude_with(Err(Fault::BadInput("pv".into())), standing, &before(), &spec);
+    assert_eq!(
+        (record.mode, record.outputs, record.manual),
+        (Mode::Manual, vec![42.0], vec![42.0])
+    );
+    // It stays there when the input is good again: a person puts it back.
+    let standing = settle(Some(&before()), &spec, &sample(vec![]), &[42.0]);
+    assert_eq!(standing.mode, Mode::Automatic, "without the fault");
+    let mut shed = before();
+    (shed.mode, shed.manual) = (record.mode, record.manual);
+    assert_eq!(settle(Some(&shed), &spec, &sample(vec![]), &[42.0]).mode, Mode::Manual);
+}
+
+#[test]
 fn the_way_back_from_a_bad_input_begins_at_the_actuator() {
     for (policy, outputs, keeps) in [
         (OnFault::Hold, 42.0, true),

@@ -89,8 +89,13 @@ impl Experiment {
         if !(plan.phase_ms >= 0.0 && plan.phase_ms < plan.period_ms) {
             return wrong("phase_ms must be 0 or more, and less than period_ms".to_owned());
         }
-        if matches!(plan.strategy, Strategy::Vote(_)) {
-            return wrong("strategy: votes are not run in the lab; use another strategy".to_owned());
+        if let Strategy::Vote(n) = plan.strategy
+            && usize::from(n) > self.cell.hosts.len()
+        {
+            return wrong(format!(
+                "strategy: vote({n}) needs {n} hosts that control, and cell.host names {}",
+                self.cell.hosts.len()
+            ));
         }
         if self.controller_of(plan).is_none() {
             return wrong("it has no controller: write [controller] for all loops, or one here".to_owned());
@@ -175,6 +180,7 @@ impl Experiment {
             }
             match event {
                 Event::Pause { for_s: time_s, .. }
+                | Event::Wrong { for_s: time_s, .. }
                 | Event::Kill {
                     back_after_s: Some(time_s),
                     ..
@@ -182,6 +188,9 @@ impl Experiment {
                     return wrong(place, "a time must be greater than 0 s");
                 }
                 Event::Load { cpu, .. } if !(0.0..=1.0).contains(cpu) => return wrong(place, "cpu must be 0 to 1"),
+                Event::Wrong { by, .. } if !by.is_finite() || *by == 0.0 => {
+                    return wrong(place, "by must be a finite number that is not 0");
+                }
                 _ => {}
             }
         }

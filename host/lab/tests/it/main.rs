@@ -8,3 +8,4 @@ mod cell;
 mod oracle;
 mod published;
 mod setup;
+mod votes;

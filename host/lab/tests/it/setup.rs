@@ -41,6 +41,12 @@ pub(crate) fn examples() -> PathBuf {
 /// Mean of a figure of the first loop in the variant with this case and these labels.
 #[track_caller]
 pub(crate) fn figure(outcome: &Outcome, case: &str, labels: &[&str], key: &str) -> f64 {
+    figure_of(outcome, 0, case, labels, key)
+}
+
+/// As [`figure`], of the loop with this number.
+#[track_caller]
+pub(crate) fn figure_of(outcome: &Outcome, loop_number: usize, case: &str, labels: &[&str], key: &str) -> f64 {
     let variant = outcome
         .variants
         .iter()
@@ -50,7 +56,7 @@ pub(crate) fn figure(outcome: &Outcome, case: &str, labels: &[&str], key: &str) 
         assert_eq!(run.failed, None);
     }
     variant
-        .summary(0, key)
+        .summary(loop_number, key)
         .unwrap_or_else(|| panic!("{case} has no {key}"))
         .mean
 }
