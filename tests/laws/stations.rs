@@ -107,8 +107,8 @@ fn split_range(draw: &mut Draw, n: u32) -> Value {
     let rest = rests_at(of("a-split"), b);
     let mut y = rest;
     let (mut pv, mut setpoint, mut out_a, mut out_b) = (vec![], vec![], vec![], vec![]);
-    for i in 0..1800 {
-        let wanted = if (100..900).contains(&i) { 8.0 } else { rest };
+    for i in 0..4500 {
+        let wanted = if (100..2500).contains(&i) { 8.0 } else { rest };
         bench.set_setpoint(wanted);
         bench.set(PV, y);
         pv.push(y);
