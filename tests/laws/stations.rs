@@ -143,7 +143,7 @@ fn gain_schedule(draw: &mut Draw, n: u32) -> Value {
         given.push((at, x));
         given.push((k, draw.between(0.2, 4.0)));
         given.push((ti, draw.between(2.0, 20.0)));
-        x += draw.between(3.0, 12.0);
+        x += draw.between(8.0, 12.0);
     }
     let mut bench = Bench::<GainSchedule>::start(&given, &[BASE]).unwrap();
     let pv = wander(draw, 50.0, 3.0, 25.0, CYCLES);

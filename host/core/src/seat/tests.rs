@@ -285,7 +285,7 @@ fn a_bad_input_may_shed_the_target_to_manual() {
     let standing = settle(Some(&before()), &spec, &sample(vec![]), &[42.0]);
     assert_eq!(standing.mode, Mode::Automatic, "without the fault");
     let mut shed = before();
-    (shed.mode, shed.manual) = (record.mode, record.manual);
+    (shed.mode, shed.manual) = (Mode::Manual, vec![42.0]);
     assert_eq!(settle(Some(&shed), &spec, &sample(vec![]), &[42.0]).mode, Mode::Manual);
 }
 
