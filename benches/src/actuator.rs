@@ -69,6 +69,40 @@ pub(crate) fn felt(
     felt
 }
 
+/// A cycle that a kill cost was lost before the kill or this long after it, in ns: a cycle and its takeovers.
+const CAUSED_NS: u64 = 50_000_000;
+
+/// Cycles lost between the two times that neither the machine's stalls explain nor the takeovers: each kill may cost one cycle,
+/// the one in which it came. Then those that takeovers explain.
+pub(crate) fn lost_beyond_takeovers(
+    journal: &Journal,
+    point: &str,
+    period_ns: u64,
+    (from_ns, to_ns): (u64, u64),
+    stalls: &Stalls,
+    kills_ns: &[u64],
+) -> (u64, u64) {
+    let mut open = kills_ns.to_vec();
+    let (mut beyond, mut by_takeover) = (0, 0);
+    for gap in journal
+        .gaps(point, 0)
+        .iter()
+        .filter(|gap| (from_ns..to_ns).contains(&gap.to_ns) && gap.cycles_missing > 0)
+    {
+        let stalled_ns = stalls.within_ns(gap.from_ns, gap.to_ns);
+        if stalled_ns >= gap.cycles_missing * (period_ns / 2) {
+            continue;
+        }
+        let killed = open
+            .iter()
+            .position(|at_ns| gap.to_ns > *at_ns && gap.from_ns < at_ns.saturating_add(CAUSED_NS));
+        let excused = u64::from(killed.map(|place| open.swap_remove(place)).is_some());
+        by_takeover += excused;
+        beyond += gap.cycles_missing - excused;
+    }
+    (beyond, by_takeover)
+}
+
 impl Felt {
     /// Takes what another part, or another actuator, felt.
     pub(crate) const fn join(&mut self, other: &Self) {
@@ -136,6 +170,46 @@ mod tests {
         let mut journal = Journal::default();
         journal.writes = writes.iter().map(write).collect();
         journal
+    }
+
+    #[test]
+    fn a_kill_explains_one_cycle_and_only_its_own() {
+        // A period of 10 ms; the cycles 3, and 6 and 7, and 20 are missing.
+        let ms = |ms: u64| ms * 1_000_000;
+        let journal = journal(&[
+            (ms(10), 1),
+            (ms(20), 2),
+            (ms(40), 4),
+            (ms(50), 5),
+            (ms(80), 8),
+            (ms(190), 19),
+            (ms(210), 21),
+        ]);
+        let lost = |stalls: &[(u64, u64)], kills_ns: &[u64]| {
+            let times: Vec<_> = stalls.iter().map(|(from, to)| (ms(*from), ms(*to))).collect();
+            let kills: Vec<_> = kills_ns.iter().map(|at| ms(*at)).collect();
+            let stalls = Stalls::of_times(&times);
+            lost_beyond_takeovers(&journal, "p", ms(10), (0, ms(1000)), &stalls, &kills)
+        };
+        // From 8 to 19 eleven cycles would be due and ten are missing as well.
+        assert_eq!(lost(&[(80, 190)], &[]), (4, 0));
+        assert_eq!(lost(&[(80, 190)], &[25]), (3, 1), "the first one is the kill's");
+        assert_eq!(
+            lost(&[(80, 190)], &[25, 55]),
+            (2, 2),
+            "of two lost cycles a kill explains one"
+        );
+        assert_eq!(
+            lost(&[(80, 190)], &[500]),
+            (4, 0),
+            "a kill after it all explains nothing"
+        );
+        assert_eq!(lost(&[(80, 190)], &[100]), (4, 0), "nor one long before the last");
+        assert_eq!(
+            lost(&[(50, 190), (25, 35)], &[55]),
+            (1, 0),
+            "what the machine explains needs no kill"
+        );
     }
 
     #[test]

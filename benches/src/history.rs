@@ -47,6 +47,8 @@ pub(crate) struct Seen {
     pub(crate) rolled_back: bool,
     /// A step ended with a fault.
     pub(crate) faulted: bool,
+    /// A change is on probation.
+    pub(crate) on_probation: bool,
 }
 
 impl Seen {
@@ -68,7 +70,31 @@ impl Seen {
             bump_percent: kind("revised").map(|event| event["bump_percent"].as_f64().unwrap_or(f64::NAN)),
             rolled_back: kind("rolled-back").is_some(),
             faulted: kind("faulted").is_some(),
+            on_probation: record["probation_cycles_left"].is_u64(),
         })
+    }
+}
+
+#[cfg(test)]
+impl Seen {
+    /// A quiet cycle at this time, for tests.
+    pub(crate) const fn of_cycle(at_ns: u64) -> Self {
+        Self {
+            loop_name: String::new(),
+            seq: 1,
+            at_ns,
+            digest: String::new(),
+            owner: String::new(),
+            stepped_by: String::new(),
+            setpoint: 40.0,
+            measurement: 40.0,
+            hedged: false,
+            took_over: false,
+            bump_percent: None,
+            rolled_back: false,
+            faulted: false,
+            on_probation: false,
+        }
     }
 }
 
@@ -300,18 +326,8 @@ mod tests {
     fn the_error_is_integrated_over_the_records_times() {
         let record = |at_ns, measurement| Seen {
             loop_name: "l".to_owned(),
-            seq: 1,
-            at_ns,
-            digest: String::new(),
-            owner: String::new(),
-            stepped_by: String::new(),
-            setpoint: 40.0,
             measurement,
-            hedged: false,
-            took_over: false,
-            bump_percent: None,
-            rolled_back: false,
-            faulted: false,
+            ..Seen::of_cycle(at_ns)
         };
         let records = [
             record(1_000_000_000, 38.0),

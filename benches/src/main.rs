@@ -16,6 +16,7 @@ mod failover;
 mod faults;
 mod history;
 mod io;
+mod killer;
 mod kills;
 mod lab;
 mod law;

@@ -243,17 +243,11 @@ mod tests {
         Seen {
             loop_name: LOOP.to_owned(),
             seq: n,
-            at_ns: n * 100_000_000,
-            digest: String::new(),
             owner: "a".to_owned(),
             stepped_by: by.to_owned(),
             setpoint: 50.0,
             measurement: if n == 3 { f64::NAN } else { 49.0 },
-            hedged: false,
-            took_over: false,
-            bump_percent: None,
-            rolled_back: false,
-            faulted: false,
+            ..Seen::of_cycle(n * 100_000_000)
         }
     }
 

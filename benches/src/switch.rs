@@ -4,7 +4,7 @@
 //! ```text
 //! the same law, another component:   pid 0.1.0 ⇄ pid 0.1.1     the output must go on exactly
 //! another law:                       pid ⇄ pidplus             bounded
-//! kills:   owner ─ kill -9 at a random moment of a swap ─► another owner ─► restarted ─► stepping ─► …
+//! kills:   owner ─ kill -9 at a moment by the seed ─► another owner ─► restarted ─► joined ─► …    in which phase, is told
 //! probation: traps, spins, returns NaN, jumps, each after a few good cycles ─► rolled back in that same cycle
 //! ```
 //! Up to 200 Hz the replicas share the steps. A faster loop is owned by the host that serves its points, as one would run it: on
@@ -12,25 +12,22 @@
 
 use std::{
     collections::BTreeMap,
-    sync::{
-        Arc,
-        atomic::{AtomicBool, AtomicU64, Ordering},
-    },
-    thread::JoinHandle,
+    sync::Arc,
     time::{Duration, Instant},
 };
 
 use bumpless_core::Digest;
 use bumpless_io::Clock;
-use bumpless_tests::{Api, Cell, CellOptions, Journal};
+use bumpless_tests::{Api, Cell, CellOptions, Journal, unix_ns};
 use clap::Args;
 use serde_json::{Value, json};
 
 use crate::{
     Options,
-    actuator::{self, felt},
+    actuator::{self, felt, lost_beyond_takeovers},
     error::Error,
     history::{History, Seen, Tally},
+    killer::{Asked, Killer, Phase},
     law,
     report::{Bound, Report},
     stall::Watch,
@@ -54,8 +51,6 @@ const MISDEEDS: [(&str, &[(&str, f64)]); 4] = [
     ("returns-nan", &[]),
     ("jumps", &[("by", 50.0)]),
 ];
-/// Between the return of a killed host and the next kill, at most, in ms; the moment is spread over it.
-const KILL_SPREAD_MS: u64 = 400;
 /// Longest wait for a swap that a kill hit.
 const SETTLE: Duration = Duration::from_secs(30);
 
@@ -71,6 +66,9 @@ pub(crate) struct Switching {
     /// Kill that loop's owner again and again while it is swapped.
     #[arg(long)]
     kill: bool,
+    /// Decides the moments of the kills.
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
 }
 
 fn rate(text: &str) -> Result<f64, String> {
@@ -120,52 +118,6 @@ impl Switching {
     }
 }
 
-/// Has the cell while the loop is swapped, and kills the loop's owner again and again, if it is to.
-struct Killer {
-    stop: Arc<AtomicBool>,
-    kills: Arc<AtomicU64>,
-    thread: JoinHandle<Result<Cell, Error>>,
-}
-
-impl Killer {
-    fn start(mut cell: Cell, kill: bool, history: Arc<History>) -> Result<Self, Error> {
-        let (stop, kills) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicU64::new(0)));
-        let (stop_there, kills_there) = (Arc::clone(&stop), Arc::clone(&kills));
-        let clock = Clock::start();
-        let thread = std::thread::Builder::new()
-            .name("killer".to_owned())
-            .spawn(move || {
-                while kill && !stop_there.load(Ordering::Relaxed) {
-                    std::thread::sleep(Duration::from_millis(clock.now_ns() / 1_000 * 7_919 % KILL_SPREAD_MS));
-                    let Some(owner) = history.last(LOOP).map(|record| record.owner) else {
-                        continue;
-                    };
-                    let place = history.place();
-                    cell.host(&owner)?.kill9();
-                    kills_there.fetch_add(1, Ordering::Relaxed);
-                    history.wait("another owner", place, |record| record.owner != owner)?;
-                    cell.restart(&owner)?;
-                    cell.wait_joined()?;
-                }
-                Ok(cell)
-            })
-            .map_err(Error::io("the killer's thread cannot be started"))?;
-        Ok(Self { stop, kills, thread })
-    }
-
-    /// Ends it; gives the cell back, and how many kills there were.
-    fn finish(self) -> Result<(Cell, u64), Error> {
-        self.stop.store(true, Ordering::Relaxed);
-        match self.thread.join() {
-            Ok(cell) => Ok((cell?, self.kills.load(Ordering::Relaxed))),
-            Err(_) => Err(Error::Waited {
-                what: "the end of the kills".to_owned(),
-                seconds: 0,
-            }),
-        }
-    }
-}
-
 /// Runs the bench.
 pub(crate) fn run(options: Options, switching: Switching, report: &mut Report) -> Result<(), Error> {
     let count = switching.count.unwrap_or_else(|| options.count(500, 40));
@@ -173,9 +125,9 @@ pub(crate) fn run(options: Options, switching: Switching, report: &mut Report) -
         "a plant and three controllers in four processes, a loop at {} Hz, {count} swaps{}",
         switching.hz(),
         if switching.kill {
-            ", the owner killed again and again"
+            format!(", the owner killed again and again, seed {}", switching.seed)
         } else {
-            ""
+            String::new()
         }
     ));
     let fopdt = "{ count = 1, gain = 1.0, tau_s = 1.0, dead_time_s = 0.1, noise = 0.002 }";
@@ -204,7 +156,9 @@ pub(crate) fn run(options: Options, switching: Switching, report: &mut Report) -
 
     let before = Tally::ask(&api, LOOP)?;
     let from_ns = clock.now_ns();
-    let killer = Killer::start(cell, switching.kill, Arc::clone(&history))?;
+    let seed = switching.kill.then_some(switching.seed);
+    let killer = Killer::start(cell, seed, LOOP, Arc::clone(&history))?;
+    let mut asked = Vec::new();
     let (mut refused, mut unchanged) = (0_u64, 0_u64);
     let mut last_refusal = String::new();
     let plus = "pidplus";
@@ -219,7 +173,13 @@ pub(crate) fn run(options: Options, switching: Switching, report: &mut Report) -
         if number % 8 == 0 {
             drop(api.setpoint(LOOP, if number % 16 == 0 { 60.0 } else { 40.0 }));
         }
-        match api.swap(LOOP, to) {
+        let asked_ns = unix_ns();
+        let end = api.swap(LOOP, to);
+        asked.push(Asked {
+            from_ns: asked_ns,
+            to_ns: unix_ns(),
+        });
+        match end {
             // After a refusal the loop may run already what the next swap asks for.
             Ok(end) => unchanged += u64::from(end["unchanged"] == true),
             Err(error) => {
@@ -228,7 +188,7 @@ pub(crate) fn run(options: Options, switching: Switching, report: &mut Report) -
             }
         }
     }
-    let (cell, kills) = killer.finish()?;
+    let (cell, kills_ns) = killer.finish()?;
     let after = Tally::ask(&api, LOOP)?;
     let to_ns = clock.now_ns();
 
@@ -255,8 +215,8 @@ pub(crate) fn run(options: Options, switching: Switching, report: &mut Report) -
     let journal = cell.journal()?;
 
     report.told("swap.rate", switching.hz(), "Hz");
-    report.told("swap.kills", kills as f64, "kills");
     let seen = history.between(LOOP, from_ns, to_ns);
+    tell_kills(report, &kills_ns, &seen, &asked);
     report.told("swap.nothing_to_change", unchanged as f64, "swaps");
     tell_switches(
         report,
@@ -271,9 +231,17 @@ pub(crate) fn run(options: Options, switching: Switching, report: &mut Report) -
     }
     let part = felt(&journal, POINT, switching.period_ns(), (from_ns, to_ns), &stalls);
     let taken_over = seen.iter().filter(|record| record.took_over).count();
-    // Each death of an owner may cost a cycle at this rate; what is beyond that is ours.
-    let lost = if switching.kill { kills as f64 } else { 0.0 };
-    part.tell(report, "swap.swapping", Bound::AtMost(lost), Bound::None);
+    part.tell(report, "swap.swapping", Bound::None, Bound::None);
+    // Each death of an owner may cost the cycle in which it comes; what is beyond that is ours.
+    let span = (from_ns, to_ns);
+    let (beyond, by_takeover) = lost_beyond_takeovers(&journal, POINT, switching.period_ns(), span, &stalls, &kills_ns);
+    report.told("swap.swapping.cycles_lost_by_takeovers", by_takeover as f64, "cycles");
+    report.figure(
+        "swap.swapping.cycles_lost_beyond",
+        beyond as f64,
+        "cycles",
+        Bound::AtMost(0.0),
+    );
     report.told("swap.swapping.takeovers", taken_over as f64, "takeovers");
     after.tell_since(before, report, "swap.swapping");
     tell_misdeeds(report, &journal, &wrong);
@@ -331,6 +299,21 @@ fn misdeed(
         faulted_seq: first.map(|record| record.seq),
         back_seq: Some(back.seq),
     })
+}
+
+/// How many kills there were, and in which phase of a change each was.
+fn tell_kills(report: &mut Report, kills_ns: &[u64], seen: &[Seen], asked: &[Asked]) {
+    report.told("swap.kills", kills_ns.len() as f64, "kills");
+    if kills_ns.is_empty() {
+        return;
+    }
+    let phases: Vec<Phase> = kills_ns.iter().map(|at_ns| Phase::at(*at_ns, seen, asked)).collect();
+    let words: Vec<&str> = phases.iter().map(|phase| phase.name()).collect();
+    report.progress(&format!("the kills, in order: {}", words.join(", ")));
+    for phase in Phase::ALL {
+        let number = phases.iter().filter(|of| **of == phase).count();
+        report.told(&format!("swap.kills.{}", phase.name()), number as f64, "kills");
+    }
 }
 
 /// The switches, told apart by whether the law stayed the same.

@@ -2,10 +2,11 @@
 //!
 //! ```text
 //! quiet ─► uploads: fresh law, swapped in at once, again and again ─► quiet ─► uploads ─► …      (rounds take turns)
-//! then: 10 MB of code; a bomb that compiles for minutes; one that eats memory; 100 uploads at once
+//! 10 MB of code, swapped in, again and again ─► quiet
+//! then: a bomb that compiles for minutes; one that eats memory; one whose start never ends; 100 uploads at once
 //! ```
-//! Jitter is how far two writes of an actuator are from one period apart, without what the machine itself stalled; the ratio
-//! is that under uploads to that of the quiet rounds of the same run.
+//! Jitter is how far two writes of an actuator are from one period apart, of every loop there is, without what the machine
+//! itself stalled; the ratio is that under uploads to that of the quiet rounds of the same run.
 
 use std::{
     thread::JoinHandle,
@@ -13,7 +14,7 @@ use std::{
 };
 
 use bumpless_io::Clock;
-use bumpless_tests::{Api, Cell, CellOptions, Journal};
+use bumpless_tests::{Answer, Api, Cell, CellOptions, Journal};
 use serde_json::{Value, json};
 
 use crate::{
@@ -38,8 +39,17 @@ const WATCHED_POINT: &str = "plant.1.out";
 const PERIOD_NS: u64 = 10_000_000;
 /// Loops beside them, at 20 Hz.
 const OTHERS: usize = 20;
+/// Their period, in ns.
+const OTHERS_PERIOD_NS: u64 = 50_000_000;
+/// Of 100 uploads at once, so many must come in: the host works on four at a time and lets others wait for 10 s, in which it
+/// gets through more than twice that number. The rest may be told to come again.
+const CROWD_TAKEN_MIN: f64 = 8.0;
 /// A large component, in bytes: its code, many times over.
 const LARGE_BYTES: usize = 10 * 1024 * 1024;
+/// So many of them: the 99th of 100 is told of no fewer than twenty.
+const LARGES: u64 = 20;
+/// Version of the first of them.
+const LARGE_VERSION: u64 = 900;
 /// A component that compiles for longer than anybody waits; near the greatest size that is taken at all.
 const BOMB_BYTES: usize = 31 * 1024 * 1024;
 /// Uploads that come at once.
@@ -96,18 +106,35 @@ pub(crate) fn run(options: Options, report: &mut Report) -> Result<(), Error> {
         quiet.push((from_ns, clock.now_ns()));
     }
 
-    report.progress("a component with 10 MB of code");
-    let from_ns = clock.now_ns();
-    let large = upload_to_running(&api, &history, &many_times(&pid, LARGE_BYTES, 900))?;
+    let larges = options.count(LARGES, 2);
+    report.progress(&format!(
+        "{larges} components with 10 MB of code, then a quarter as long without"
+    ));
+    let (from_ns, started, mut large) = (clock.now_ns(), Instant::now(), Spread::new());
+    for number in 0..larges {
+        let bytes = many_times(&pid, LARGE_BYTES, LARGE_VERSION + number);
+        large.add(upload_to_running(&api, &history, &bytes)?);
+    }
     let large_span = (from_ns, clock.now_ns());
+    let from_ns = clock.now_ns();
+    std::thread::sleep(started.elapsed() / 4);
+    quiet.push((from_ns, clock.now_ns()));
     api.swap(CHANGED, "pid@0.1.0")?;
 
     report.progress("bombs, and 100 uploads at once");
     let from_ns = clock.now_ns();
     let bombs = [
-        ("compile_bomb", answer(&api, &many_times(&pid, BOMB_BYTES, 901))),
-        ("memory_bomb", answer(&api, &guest("grows-memory")?)),
-        ("endless_start", answer(&api, &guest("start-spins")?)),
+        (
+            "compile_bomb",
+            &["compil", "machine code"][..],
+            answer(&api, &many_times(&pid, BOMB_BYTES, LARGE_VERSION + 99)),
+        ),
+        ("memory_bomb", &["of memory"], answer(&api, &guest("grows-memory")?)),
+        (
+            "endless_start",
+            &["does not start"],
+            answer(&api, &guest("start-spins")?),
+        ),
     ];
     let crowd = crowd(&api, &pid)?;
     let bombs_span = (from_ns, clock.now_ns());
@@ -120,15 +147,26 @@ pub(crate) fn run(options: Options, report: &mut Report) -> Result<(), Error> {
     for (part, text) in [(0.5, "p50"), (0.99, "p99")] {
         report.told(&format!("upload.to_running.{text}"), to_running.us(part) / 1e3, "ms");
     }
-    report.told("upload.to_running_10mb", large as f64 / 1e6, "ms");
-    let jitter = |spans: &[Span]| jitter(&journal, spans, &stalls);
-    let (without, with) = (jitter(&quiet), jitter(&busy));
-    for (part, text) in [(0.5, "p50"), (0.99, "p99"), (0.999, "p99_9")] {
-        report.told(&format!("upload.jitter_without.{text}"), without.us(part), "µs");
-        report.told(&format!("upload.jitter_with.{text}"), with.us(part), "µs");
+    report.told("upload.uploads_10mb", large.count() as f64, "components");
+    for (part, text) in [(0.5, "p50"), (0.99, "p99")] {
+        report.told(&format!("upload.to_running_10mb.{text}"), large.us(part) / 1e3, "ms");
     }
-    let ratio = with.us(0.999) / without.us(0.999).max(1.0);
-    report.figure("upload.jitter_ratio.p99_9", ratio, "×", Bound::AtMost(1.1));
+    let jitter = |spans: &[Span]| jitter(&journal, spans, &stalls);
+    let (without, with, with_large) = (jitter(&quiet), jitter(&busy), jitter(&[large_span]));
+    for (spread, name) in [
+        (&without, "jitter_without"),
+        (&with, "jitter_with"),
+        (&with_large, "jitter_with_10mb"),
+    ] {
+        report.told(&format!("upload.{name}.pauses"), spread.count() as f64, "pauses");
+        for (part, text) in [(0.5, "p50"), (0.99, "p99"), (0.999, "p99_9")] {
+            report.told(&format!("upload.{name}.{text}"), spread.us(part), "µs");
+        }
+    }
+    for (spread, name) in [(&with, "jitter_ratio"), (&with_large, "jitter_ratio_10mb")] {
+        let ratio = spread.us(0.999) / without.us(0.999).max(1.0);
+        report.figure(&format!("upload.{name}.p99_9"), ratio, "×", Bound::AtMost(1.1));
+    }
     for (name, spans) in [
         ("while_uploading", busy.as_slice()),
         ("with_10mb", &[large_span]),
@@ -140,8 +178,12 @@ pub(crate) fn run(options: Options, report: &mut Report) -> Result<(), Error> {
         }
         all.tell(report, &format!("upload.{name}"), Bound::AtMost(0.0), Bound::None);
     }
-    for (name, status) in &bombs {
-        let refused = status.as_ref().is_ok_and(|status| (400..500).contains(status));
+    for (name, words, end) in &bombs {
+        let refused = end.as_ref().is_ok_and(|answer| is_refusal(answer, words));
+        if !refused {
+            let said = end.as_ref().map_or_else(ToString::to_string, |answer| answer.text());
+            report.progress(&format!("{name} was not refused for what it is: {said}"));
+        }
         report.figure(
             &format!("upload.{name}.refused"),
             f64::from(refused),
@@ -149,7 +191,12 @@ pub(crate) fn run(options: Options, report: &mut Report) -> Result<(), Error> {
             Bound::AtLeast(1.0),
         );
     }
-    report.told("upload.crowd.taken", crowd.taken as f64, "components");
+    report.figure(
+        "upload.crowd.taken",
+        crowd.taken as f64,
+        "components",
+        Bound::AtLeast(CROWD_TAKEN_MIN),
+    );
     report.told("upload.crowd.told_to_wait", crowd.busy as f64, "answers");
     report.figure(
         "upload.crowd.other_answers",
@@ -211,16 +258,16 @@ fn wait_ready(api: &Api, digest: &str) -> Result<(), Error> {
     }
 }
 
-/// How far two writes of the watched actuator are from one period apart, in ns, without the machine's stalls.
+/// How far two writes of an actuator are from one period apart, in ns, without the machine's stalls; of every loop.
 fn jitter(journal: &Journal, spans: &[Span], stalls: &Stalls) -> Spread {
     let mut spread = Spread::new();
-    for gap in journal.gaps(WATCHED_POINT, 0) {
-        if spans
-            .iter()
-            .any(|(from_ns, to_ns)| (*from_ns..*to_ns).contains(&gap.to_ns))
-            && stalls.within_ns(gap.from_ns, gap.to_ns) == 0
-        {
-            spread.add(gap.ns().abs_diff(PERIOD_NS));
+    for number in 0..OTHERS + 2 {
+        let period_ns = if number < 2 { PERIOD_NS } else { OTHERS_PERIOD_NS };
+        for gap in journal.gaps(&format!("plant.{number}.out"), 0) {
+            let within = |(from_ns, to_ns): &Span| (*from_ns..*to_ns).contains(&gap.to_ns);
+            if spans.iter().any(within) && stalls.within_ns(gap.from_ns, gap.to_ns) == 0 {
+                spread.add(gap.ns().abs_diff(period_ns));
+            }
         }
     }
     spread
@@ -274,10 +321,15 @@ fn guest(name: &str) -> Result<Vec<u8>, Error> {
     std::fs::read(&path).map_err(Error::io(format!("{} cannot be read", path.display())))
 }
 
-/// The status of an upload's answer.
-fn answer(api: &Api, bytes: &[u8]) -> Result<u16, Error> {
-    let answer = api.send("POST", "/v1/components", &[("content-type", "application/wasm")], bytes)?;
-    Ok(answer.status)
+/// The answer to an upload.
+fn answer(api: &Api, bytes: &[u8]) -> Result<Answer, Error> {
+    Ok(api.send("POST", "/v1/components", &[("content-type", "application/wasm")], bytes)?)
+}
+
+/// Was a component refused for what it is, in words that say so? An answer that only asks to come again is no refusal.
+fn is_refusal(answer: &Answer, words: &[&str]) -> bool {
+    let text = answer.text();
+    answer.status == 422 && words.iter().any(|word| text.contains(word))
 }
 
 #[derive(Default)]
@@ -294,7 +346,7 @@ fn crowd(api: &Api, pid: &[u8]) -> Result<Crowd, Error> {
         let (api, bytes) = (api.clone(), fresh(pid, 500 + number).unwrap_or_default());
         std::thread::Builder::new()
             .name(format!("upload-{number}"))
-            .spawn(move || answer(&api, &bytes).ok())
+            .spawn(move || answer(&api, &bytes).ok().map(|answer| answer.status))
             .map_err(Error::io("an upload's thread cannot be started"))
     };
     let threads = (0..CROWD).map(send).collect::<Result<Vec<_>, _>>()?;
@@ -320,6 +372,34 @@ mod tests {
     #![allow(clippy::unwrap_used, reason = "tests")]
 
     use super::*;
+
+    #[test]
+    fn only_a_refusal_for_what_it_is_counts() {
+        let answer = |status: u16, detail: &str| Answer {
+            status,
+            headers: std::collections::BTreeMap::new(),
+            body: json!({ "detail": detail }).to_string().into_bytes(),
+        };
+        let words = ["compil", "machine code"];
+        for (status, detail, counts) in [
+            (
+                422,
+                "compiling the component took longer than 20 s and was stopped",
+                true,
+            ),
+            (
+                422,
+                "the component becomes more than 64 MiB of machine code; simplify it",
+                true,
+            ),
+            (422, "import \"wasi:io\" is not offered to controllers", false),
+            (429, "compiling takes too long now", false),
+            (503, "other components are being compiled; try again", false),
+            (201, "compiled", false),
+        ] {
+            assert_eq!(is_refusal(&answer(status, detail), &words), counts, "{status} {detail}");
+        }
+    }
 
     #[test]
     fn a_large_component_is_one_that_the_engine_takes() {

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use bumpless_tests::{Api, Cell, CellOptions, Feed, first_order_loop};
+use bumpless_tests::{Api, Cell, CellOptions, Feed, Journal, first_order_loop};
 use serde_json::{Value, json};
 
 use crate::{number, one_writer, text, whole};
@@ -34,25 +34,20 @@ fn event<'a>(record: &'a Value, kind: &str) -> Option<&'a Value> {
         .find(|event| event["kind"] == kind)
 }
 
-/// Greatest step of the actuator from one cycle to the next, from a cycle on.
-fn greatest_step(cell: &Cell, from_seq: u64) -> f64 {
-    let journal = cell.journal().unwrap();
-    let values: Vec<f64> = journal
-        .of(POINT)
-        .filter(|write| write.seq >= from_seq)
-        .map(|write| write.value)
-        .collect();
-    assert!(values.len() > 10, "there is something to judge");
-    values
-        .windows(2)
-        .map(|pair| (pair[1] - pair[0]).abs())
-        .fold(0.0, f64::max)
+/// How much farther the actuator stepped in the cycle of a switch, and in the three after it, than in the twenty before it.
+fn kick(journal: &Journal, seq: u64) -> f64 {
+    let greatest = |from: u64, to: u64| {
+        let around: Vec<_> = journal.of(POINT).filter(|w| (from..=to).contains(&w.seq)).collect();
+        assert!(around.len() > 3, "there is something to judge from {from} to {to}");
+        let steps = around.windows(2).map(|pair| (pair[1].value - pair[0].value).abs());
+        steps.fold(0.0, f64::max)
+    };
+    greatest(seq - 1, seq + 3) - greatest(seq - 21, seq - 1)
 }
 
 #[test]
 fn structure_changes_while_the_loop_runs_each_as_one_revision_without_a_bump() {
     let (cell, api, feed) = running(2, 50.0);
-    let from_seq = whole(&feed.record().unwrap()["seq"]);
     let revision = || whole(&api.loop_view(LOOP).unwrap()["revision"]);
     let mut expected = revision();
     let cascade = |period_ms: f64| {
@@ -67,6 +62,12 @@ fn structure_changes_while_the_loop_runs_each_as_one_revision_without_a_bump() {
         draft["parameters"]["inner-ti"] = json!(30.0);
         draft
     };
+    let rebound = {
+        let mut draft = cascade(20.0);
+        draft["ports"]["inner-pv"] = json!("plant.0.pv");
+        draft["parameters"]["inner-ti"] = json!(30.0);
+        draft
+    };
     let steps = [
         ("another law with other ports and parameters", cascade(50.0)),
         ("another tuning", retuned.clone()),
@@ -75,8 +76,11 @@ fn structure_changes_while_the_loop_runs_each_as_one_revision_without_a_bump() {
             draft["period_ms"] = json!(20.0);
             draft
         }),
+        // The other level is tens of per cent away: what the law remembers is of no use, and the output goes on all the same.
+        ("another point at an input", rebound),
         ("back to one loop", first_order_loop(0, "pid", 50.0)),
     ];
+    let mut switched = Vec::new();
     for (what, draft) in steps {
         let end = api.apply(&draft).unwrap_or_else(|error| panic!("{what}: {error}"));
         expected += 1;
@@ -95,14 +99,35 @@ fn structure_changes_while_the_loop_runs_each_as_one_revision_without_a_bump() {
         );
         let record = feed.record_where(what, |r| whole(&r["revision"]) == expected).unwrap();
         assert!(event(&record, "revised").is_some(), "{what}: {record}");
+        switched.push((what, whole(&record["seq"])));
+        feed.record_where("some cycles more", |r| {
+            whole(&r["seq"]) > whole(&record["seq"]) + 25
+        })
+        .unwrap();
     }
     let period = api.loop_view(LOOP).unwrap();
-    assert_eq!(period["past_revisions"].as_array().map(Vec::len), Some(4));
-    assert!(
-        greatest_step(&cell, from_seq) < 2.0,
-        "{}",
-        greatest_step(&cell, from_seq)
-    );
+    assert_eq!(period["past_revisions"].as_array().map(Vec::len), Some(5));
+    let journal = cell.journal().unwrap();
+    for (what, seq) in switched {
+        let kick = kick(&journal, seq);
+        assert!(kick < 0.1, "{what}: a step of {kick} % of span more than before");
+    }
+
+    // Another actuator, and its own measurement: it goes on from what that one holds, and the old one stays where it is.
+    let mut elsewhere = first_order_loop(1, "pid", 50.0);
+    elsewhere["name"] = json!(LOOP);
+    let before = number(&api.point(POINT).unwrap()["value"]);
+    let held = number(&api.point("plant.1.out").unwrap()["value"]);
+    assert!((before - held).abs() > 10.0, "{before} and {held} are far apart");
+    let end = api.apply(&elsewhere).unwrap();
+    assert!(number(&end["hand_over"]["bump_percent"]) < 0.1, "{end}");
+    let record = feed
+        .record_where("the other actuator", |r| whole(&r["revision"]) == expected + 1)
+        .unwrap();
+    let first = number(&record["outputs"]["out"]);
+    assert!((first - held).abs() < 0.1, "{first} where {held} was held");
+    let left = number(&api.point(POINT).unwrap()["value"]);
+    assert!((left - before).abs() < 0.5, "the old actuator went from {before} to {left}");
     one_writer(&cell.journal().unwrap());
 }
 

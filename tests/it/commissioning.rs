@@ -95,7 +95,7 @@ fn ended(api: &Api, id: &str) -> Value {
 }
 
 #[test]
-fn a_force_outlives_the_owner_and_the_host() {
+fn a_force_outlives_the_owner_and_the_host_and_the_loop_comes_back_without_a_bump() {
     let mut cell = Cell::start(CellOptions::default().controllers(2)).unwrap();
     let api = cell.api().unwrap();
     api.upload_stock(&["pid"]).unwrap();
@@ -159,7 +159,30 @@ fn a_force_outlives_the_owner_and_the_host() {
             events.iter().any(|event| event["kind"] == "unforced")
         })
         .unwrap();
-    assert!(number(&free["outputs"]["out"]).is_finite(), "the loop writes again");
+    // It starts from what the actuator holds: what it sends next is that, not where it was before the force.
+    let sent = number(&free["outputs"]["out"]);
+    assert!((sent - 3.25).abs() < 0.01, "{sent} V after 3.25 V were held");
+    // And whoever repeats the recorded steps begins anew in the same cycle, to the last bit.
+    let after = feed
+        .record_where("cycles after the force", |record| {
+            record["seq"].as_u64() > free["seq"].as_u64().map(|seq| seq + 10)
+        })
+        .unwrap();
+    assert!((number(&after["outputs"]["out"]) - sent).abs() < 2.0, "{after}");
+    let replayed = api
+        .wait_until("a replay past the end of the force", |api| {
+            let replay = api
+                .post(&format!("/v1/loops/{name}/replay"), &json!({ "last": "60" }))
+                .unwrap();
+            if replay["compared"].as_u64() >= Some(40) {
+                Ok(replay)
+            } else {
+                Err(replay)
+            }
+        })
+        .unwrap();
+    assert!(replayed["first_difference"].is_null(), "{replayed}");
+    assert_eq!(replayed["compared"], replayed["equal"], "{replayed}");
     let journal = std::fs::read_to_string(cell.folder().join(PLANT).join("writes.csv")).unwrap();
     assert!(
         journal.lines().any(|line| line.starts_with("#forced,")),

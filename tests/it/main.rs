@@ -5,6 +5,7 @@
 //! | story | a loop's whole life: swaps, commands, the death of its owner |
 //! | restarts | the whole cell, or the I/O host alone, dies and comes back |
 //! | changes | what may change while a loop runs, what brings it back, and owners that die meanwhile |
+//! | phases | the owner dies in each phase of an upload, a backtest, a change, a rollout |
 //! | commissioning | points by hand, forces, jobs, point lists |
 //! | masters | two hosts for one device |
 //! | members | frozen owners, late hosts, hosts that leave |
@@ -49,6 +50,7 @@ mod masters;
 mod members;
 mod modbus;
 mod neighbours;
+mod phases;
 mod refusals;
 mod restarts;
 mod rollouts;

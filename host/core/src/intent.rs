@@ -10,9 +10,12 @@
 //! Owns: the numbering of revisions. A number is given once and never again, so a late command that names a withdrawn
 //! revision finds nothing instead of something else. Never: decides whether a revision is good; that is deployment's.
 
+use std::collections::BTreeSet;
+
 use serde::{Deserialize, Serialize};
 
 use crate::{
+    digest::Digest,
     name::{HostId, LoopId},
     spec::LoopSpec,
 };
@@ -193,6 +196,15 @@ impl Intent {
         std::iter::once(&self.current).chain(&self.pending).chain(&self.past)
     }
 
+    /// Every component that this loop may need: those of all revisions there are, and their fallbacks. Any of these revisions can
+    /// be gone back to for as long as its components are there.
+    #[must_use]
+    pub fn components(&self) -> BTreeSet<Digest> {
+        self.revisions()
+            .flat_map(|spec| std::iter::once(spec.digest).chain(spec.fallback))
+            .collect()
+    }
+
     /// Where this copy stands among the copies of the loop's intent: the greater one is newer. It holds across the removal
     /// and new creation of a loop, because revision numbers go on.
     #[must_use]
@@ -345,6 +357,31 @@ mod tests {
         }
         assert_eq!(intent.past.len(), PAST_REVISIONS_MAX);
         assert_eq!(numbers(&intent).2, (14..30).rev().collect::<Vec<_>>());
+    }
+
+    #[test]
+    fn the_components_of_every_revision_and_their_fallbacks_are_needed() {
+        let of = |name: &str| Digest::of(name.as_bytes());
+        let with = |component: &str, fallback: Option<&str>| LoopSpec {
+            digest: of(component),
+            fallback: fallback.map(of),
+            ..spec(1.0)
+        };
+        let mut intent = Intent::new(HostId::new("io-1").unwrap(), with("a", Some("fa")), 0).unwrap();
+        for (n, component) in [(2, "b"), (3, "c")] {
+            intent.propose(with(component, None)).unwrap();
+            intent.commit(n).unwrap();
+        }
+        intent.propose(with("d", Some("fd"))).unwrap();
+        let all = ["a", "fa", "b", "c", "d", "fd"].map(of);
+        assert_eq!(intent.components(), all.into_iter().collect());
+        // One that is too long ago to go back to is needed no more.
+        intent.withdraw(4).unwrap();
+        for n in 5..5 + PAST_REVISIONS_MAX as u64 {
+            intent.propose(with("e", None)).unwrap();
+            intent.commit(n).unwrap();
+        }
+        assert_eq!(intent.components(), ["c", "e"].map(of).into_iter().collect());
     }
 
     #[test]

@@ -142,6 +142,36 @@ impl Standing {
     }
 }
 
+/// The state that a step goes on from: the base's, unless that is another component's, or empty, or an output was held by a
+/// person until the base and is not any more. In these cases the controller starts from what the actuators hold: what it
+/// remembers belongs to where the output was before the force. It follows from the base and this cycle's readings alone, so
+/// whoever repeats a recorded step decides the same.
+#[must_use]
+pub fn carried<'a>(
+    base: Option<&'a Record>,
+    spec: &LoopSpec,
+    wiring: &Wiring,
+    readings: &[Reading],
+) -> Option<&'a Arc<[u8]>> {
+    base.filter(|r| r.digest == spec.digest && !r.state.is_empty())
+        .filter(|r| r.revision != spec.revision || !released(&r.readings, readings, wiring))
+        .map(|r| &r.state)
+}
+
+/// Was an output held by a person in the readings before, and is no longer? Both in the order of `wiring`'s ports.
+#[must_use]
+pub fn released(before: &[Reading], now: &[Reading], wiring: &Wiring) -> bool {
+    let forced = |readings: &[Reading], port: u8| {
+        readings
+            .get(usize::from(port))
+            .is_some_and(|r| r.quality == Quality::Forced)
+    };
+    wiring
+        .outputs
+        .iter()
+        .any(|&port| forced(before, port) && !forced(now, port))
+}
+
 /// The frame of a cycle.
 #[must_use]
 pub fn frame(
@@ -295,9 +325,7 @@ pub fn conclude(c: Conclusion<'_>) -> Record {
     let held = wiring.held_since(&readings, base, spec.revision);
     tell_forces(&readings, base, spec, &mut events);
     let faults_before = base.map_or(0, |r| r.faults_in_row);
-    let wanted_before = base
-        .filter(|r| r.wanted.len() == held.len())
-        .map_or_else(|| held.clone(), |r| r.wanted.clone());
+    let wanted_before = wiring.wanted_since(base, &held, spec.revision);
     let (faults_in_row, wanted, outputs, effects, by, step_ns) = match step {
         Ok(Stepped { effects, by, step_ns }) => {
             let wanted = wiring.wanted(&effects.writes, &wanted_before);

@@ -9,7 +9,7 @@
 //!           (same cycle, old component, start from what the actuators hold)
 //! ```
 
-use crate::{record::Record, spec::LoopSpec};
+use crate::{record::Record, spec::LoopSpec, wiring::Wiring};
 
 /// How the controller's state comes over.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -61,6 +61,28 @@ pub fn bump_percent(old_outputs: &[f64], new_outputs: &[f64], spans: &[f64]) -> 
         )
 }
 
+/// The bump of a switch from the outputs of one revision to those of another, in % of span, for the worst one. Outputs are the
+/// same where they drive the same point. One whose point the old revision did not drive is compared with `actuators`, what the
+/// new one's actuators hold. One that drives no point moves nothing, and does not count.
+#[must_use]
+pub fn bump_between(
+    (old, old_outputs): (&Wiring, &[f64]),
+    (new, new_outputs): (&Wiring, &[f64]),
+    actuators: &[f64],
+) -> f64 {
+    if new_outputs.len() != new.outputs.len() {
+        return f64::INFINITY;
+    }
+    let before = new.outputs_from(old_outputs, old, actuators);
+    let connected = |i: &usize| new.driven(*i).is_some();
+    let of = |values: &[f64]| -> Vec<f64> {
+        let each = values.iter().copied().enumerate();
+        each.filter(|(i, _)| connected(i)).map(|(_, value)| value).collect()
+    };
+    let spans: Vec<f64> = (0..new_outputs.len()).filter(connected).map(|i| new.span(i)).collect();
+    bump_percent(&of(&before), &of(new_outputs), &spans)
+}
+
 /// The probation that the next record carries: it counts down and ends by itself.
 #[must_use]
 pub fn probation_after(before: Option<&Record>) -> Option<(u64, u32)> {
@@ -80,6 +102,55 @@ mod tests {
         assert_eq!(bump_percent(&[50.0, 5.0], &[50.5, 6.0], &[100.0, 10.0]), 10.0);
         assert_eq!(bump_percent(&[50.0], &[f64::NAN], &[100.0]), f64::INFINITY);
         assert_eq!(bump_percent(&[50.0], &[50.0, 1.0], &[100.0, 1.0]), f64::INFINITY);
+    }
+
+    #[test]
+    fn outputs_are_compared_by_the_point_that_they_drive() {
+        let wiring = |points: &[Option<&str>]| Wiring {
+            points: points
+                .iter()
+                .map(|p| p.map(|p| crate::PointId::new(p).expect("valid")))
+                .collect(),
+            outputs: (0..=u8::MAX).zip(points).map(|(i, _)| i).collect(),
+            limits: points
+                .iter()
+                .map(|_| crate::OutputLimit {
+                    low: 0.0,
+                    high: 100.0,
+                    rate_per_s: None,
+                    safe: 0.0,
+                })
+                .collect(),
+            required_inputs: vec![],
+            parameters: vec![],
+            connected: 0,
+        };
+        let (a, b, c) = (Some("v.a"), Some("v.b"), Some("v.c"));
+        let old = wiring(&[a, b]);
+        for (new, outputs, actuators, manual, bump) in [
+            // The same two valves under ports of another order: nothing moves.
+            (wiring(&[b, a]), [60.0, 20.0], [0.0, 0.0], vec![60.0, 20.0], 0.0),
+            (wiring(&[b, a]), [20.0, 60.0], [0.0, 0.0], vec![60.0, 20.0], 40.0),
+            // Another valve: compared with what it holds, whatever the old one's was.
+            (wiring(&[c, b]), [7.0, 60.0], [7.0, 0.0], vec![7.0, 60.0], 0.0),
+            (wiring(&[c, b]), [20.0, 60.0], [7.0, 0.0], vec![7.0, 60.0], 13.0),
+            // A port without a point moves nothing.
+            (wiring(&[a, None]), [20.0, 9e9], [0.0, 3.0], vec![20.0, 3.0], 0.0),
+        ] {
+            assert_eq!(
+                new.outputs_from(&[20.0, 60.0], &old, &actuators),
+                manual,
+                "{:?}",
+                new.points
+            );
+            let got = bump_between((&old, &[20.0, 60.0]), (&new, &outputs), &actuators);
+            assert_eq!(got, bump, "{:?}", new.points);
+        }
+        assert_eq!(bump_between((&old, &[1.0, 2.0]), (&old, &[1.0]), &[0.0]), f64::INFINITY);
+        assert_eq!(
+            bump_between((&old, &[1.0, 2.0]), (&old, &[1.0, f64::NAN]), &[0.0, 0.0]),
+            f64::INFINITY
+        );
     }
 
     #[test]

@@ -120,6 +120,40 @@ impl Wiring {
             .collect()
     }
 
+    /// What the controller wanted before this cycle, one value per output: what the record before says, if that was under this
+    /// revision, else what the actuators hold. Another revision's outputs may be others in the same number.
+    #[must_use]
+    pub fn wanted_since(&self, base: Option<&Record>, held: &[f64], revision: u64) -> Vec<f64> {
+        base.filter(|r| r.revision == revision && r.wanted.len() == held.len())
+            .map_or_else(|| held.to_vec(), |r| r.wanted.clone())
+    }
+
+    /// The point that an output drives.
+    #[must_use]
+    pub fn driven(&self, output: usize) -> Option<&PointId> {
+        let port = self.outputs.get(output)?;
+        self.points.get(usize::from(*port))?.as_ref()
+    }
+
+    /// The output of `other` that drives the same point as this output of ours.
+    #[must_use]
+    pub fn same_output(&self, output: usize, other: &Self) -> Option<usize> {
+        let wanted = self.driven(output)?;
+        (0..other.outputs.len()).find(|i| other.driven(*i) == Some(wanted))
+    }
+
+    /// Values of `other`'s outputs as ours, one per output: found by the point that both drive, never by their place; `or`
+    /// where the other drives another point. `or` has one value per output of ours.
+    #[must_use]
+    pub fn outputs_from(&self, values: &[f64], other: &Self, or: &[f64]) -> Vec<f64> {
+        (0..self.outputs.len())
+            .map(|i| {
+                let same = self.same_output(i, other).and_then(|j| values.get(j));
+                same.or_else(|| or.get(i)).copied().unwrap_or(f64::NAN)
+            })
+            .collect()
+    }
+
     /// Span of an output, in its unit; 100 where it has none, so that a percentage still means something.
     #[must_use]
     pub fn span(&self, output: usize) -> f64 {

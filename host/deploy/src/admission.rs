@@ -16,7 +16,7 @@ use std::{sync::Arc, time::Duration};
 use bumpless_core::{
     Admission, ComponentInfo, Finding, Fit, HostId, LoopSpec, Severity, Verdict, admission::FINDINGS_MAX,
 };
-use bumpless_engine::Prepared;
+use bumpless_engine::{INTERFACES, Prepared};
 use tokio::{sync::oneshot, time::timeout};
 
 use crate::{
@@ -26,9 +26,6 @@ use crate::{
     limits::{TRIAL_STACK_BYTES, TRIAL_WAIT},
     room::Room,
 };
-
-/// Interfaces that a controller may import; the engine refuses all others.
-const GRANTED: usize = 6;
 
 impl Room {
     /// Tries a component that was inspected. `compile_time` is none where compiled code was at hand.
@@ -92,18 +89,13 @@ fn report(
     checked_at_unix_ms: u64,
 ) -> Admission {
     let mut findings = trial.findings.clone();
-    let names: Vec<&str> = imports
-        .iter()
-        .map(|import| {
-            let name = import.rsplit('/').next().unwrap_or(import);
-            name.split('@').next().unwrap_or(name)
-        })
-        .collect();
+    let names: Vec<&str> = imports.iter().map(|import| interface(import)).collect();
     findings.push(Finding {
         severity: Severity::Info,
         text: format!(
-            "it imports {} of the {GRANTED} interfaces that a controller is granted: {}",
+            "it imports {} of the {} interfaces that a controller may be granted: {}",
             names.len(),
+            INTERFACES.len(),
             if names.is_empty() {
                 "none".to_owned()
             } else {
@@ -163,9 +155,56 @@ pub(crate) fn let_in(mut admission: Admission, name: &str, force: bool, by: &str
     Ok(admission)
 }
 
+/// The short name of an interface: `bumpless:control/net@0.1.0` is `net`.
+fn interface(import: &str) -> &str {
+    let name = import.rsplit('/').next().unwrap_or(import);
+    name.split('@').next().unwrap_or(name)
+}
+
+/// What a person should know before a component runs a loop; or why it may not.
+pub(crate) fn warnings(info: &ComponentInfo, spec: &LoopSpec, ran_before: bool) -> Result<Vec<String>, Error> {
+    let mut warnings = step_warnings(info, spec, ran_before)?;
+    warnings.extend(grant_warnings(info, spec));
+    warnings.extend(late_limit(spec));
+    Ok(warnings)
+}
+
+/// A step limit so long that the home looks for another owner before a step that never ends is stopped: then probation cannot
+/// lead back within that cycle.
+fn late_limit(spec: &LoopSpec) -> Option<String> {
+    let (limit_us, takeover_us) = (
+        spec.step_limit_ns() as f64 / 1e3,
+        spec.period_ns as f64 * spec.policy.takeover_part / 1e3,
+    );
+    (limit_us >= takeover_us).then(|| {
+        format!(
+            "policy.step_limit_us = {limit_us:.0} lasts beyond the time at which a cycle is overdue, {takeover_us:.0} µs: a step \
+             that never ends is gone back from in a later cycle, not in its own"
+        )
+    })
+}
+
+/// Where what the component imports and what the loop grants do not go together. Points are granted by the ports, alarms and log
+/// lines to everyone; what a loop grants by its own choice are the topics that it listens to.
+fn grant_warnings(info: &ComponentInfo, spec: &LoopSpec) -> Option<String> {
+    let imports_net = info.imports.iter().any(|import| interface(import) == "net");
+    let (title, id) = (title(info), &spec.id);
+    match (imports_net, spec.listens.as_slice()) {
+        (true, []) => Some(format!(
+            "{title} imports net, and loop {id} grants it no topic: it can publish messages and will receive none; name its \
+             topics under listens if it needs them"
+        )),
+        (false, [_, ..]) => Some(format!(
+            "loop {id} listens to {}, and {title} does not import net: it will never see these messages",
+            spec.listens.join(", ")
+        )),
+        _ => None,
+    }
+}
+
 /// What a component's measured steps mean for a loop: words of warning, or a refusal. A loop that ran it before within
 /// this limit is only warned: going back must always be possible.
-pub(crate) fn step_warnings(info: &ComponentInfo, spec: &LoopSpec, ran_before: bool) -> Result<Vec<String>, Error> {
+fn step_warnings(info: &ComponentInfo, spec: &LoopSpec, ran_before: bool) -> Result<Vec<String>, Error> {
     let Some(admission) = &info.admission else {
         return Ok(Vec::new());
     };
@@ -177,8 +216,8 @@ pub(crate) fn step_warnings(info: &ComponentInfo, spec: &LoopSpec, ran_before: b
         Fit::Fits => Ok(Vec::new()),
         Fit::Beyond if !ran_before => Err(Error::refused(
             format!(
-                "{} is too slow for loop {}: one step in a hundred took more than {p99:.1} µs in its trial on host \
-                 {host}, and the loop's limit is {limit:.1} µs",
+                "{} is too slow for loop {}: its longest step took {worst:.1} µs in its trial on host {host} (99 of 100 took \
+                 at most {p99:.1} µs), and the loop's limit is {limit:.1} µs",
                 title(info),
                 spec.id
             ),
@@ -236,7 +275,12 @@ mod tests {
     fn the_gravest_finding_is_the_verdict() {
         let passed = admission(&[]);
         assert_eq!((passed.verdict, passed.findings.len()), (Verdict::Passed, 1));
-        assert!(passed.findings.iter().any(|f| f.text.ends_with("is granted: io, log")));
+        assert!(
+            passed
+                .findings
+                .iter()
+                .any(|f| f.text.ends_with("may be granted: io, log"))
+        );
         assert_eq!(
             (
                 passed.step_p50_ns,

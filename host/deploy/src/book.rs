@@ -8,7 +8,7 @@ use std::{
     sync::Arc,
 };
 
-use bumpless_core::{HostId, Intent, LoopId, PointId};
+use bumpless_core::{Digest, HostId, Intent, LoopId, PointId};
 use bumpless_store::{Store, Tombstone};
 use parking_lot::RwLock;
 
@@ -253,23 +253,16 @@ impl Book {
         writers
     }
 
-    /// Loops that run this component, are about to, or go back to it in a probation or when they are told "back". Revisions
-    /// before that may need the component to be uploaded again.
-    pub(crate) fn users_of(&self, digest: &bumpless_core::Digest) -> Vec<LoopId> {
-        let pages = self.pages.read();
-        let uses = |intent: &Intent| {
-            intent.revisions().take(2).any(|s| s.fallback == Some(*digest))
-                || intent.current.digest == *digest
-                || intent.pending.as_ref().is_some_and(|s| s.digest == *digest)
-                || intent.past.first().is_some_and(|s| s.digest == *digest)
-                || intent.previous().is_some_and(|s| s.digest == *digest)
-        };
-        pages
-            .intents
-            .values()
-            .filter(|i| uses(i))
-            .map(|i| i.loop_id.clone())
-            .collect()
+    /// The loops that need each component: for what runs, for what is on its way, and for every earlier revision that can
+    /// be gone back to, with their fallbacks.
+    pub(crate) fn users(&self) -> BTreeMap<Digest, Vec<LoopId>> {
+        let mut users: BTreeMap<Digest, Vec<LoopId>> = BTreeMap::new();
+        for intent in self.pages.read().intents.values() {
+            for digest in intent.components() {
+                users.entry(digest).or_default().push(intent.loop_id.clone());
+            }
+        }
+        users
     }
 
     /// The home of a loop.

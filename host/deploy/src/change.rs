@@ -24,7 +24,7 @@ use tracing::{Instrument as _, info_span};
 
 use crate::{
     SPANS,
-    admission::step_warnings,
+    admission,
     bench::stopping,
     change::readiness::Readiness,
     draft::LoopDraft,
@@ -278,7 +278,7 @@ impl Room {
         let facts = |point: &_| self.point_facts(point, &id);
         let spec = plan::spec(draft, info.digest, &info.descriptor, &self.ground(&facts))?;
         self.check_fallback(&spec, info, fallback)?;
-        let warnings = step_warnings(info, &spec, false)?;
+        let warnings = admission::warnings(info, &spec, false)?;
         if self.book.len() >= LOOPS_MAX {
             return Err(Error::busy(
                 format!("the cell has {LOOPS_MAX} loops, the most it may have"),
@@ -353,7 +353,7 @@ impl Room {
         // What ran before within this limit may always be gone back to, and so may what was chosen for the worst case.
         let ran = |past: &LoopSpec| past.digest == spec.digest && past.step_limit_ns() == spec.step_limit_ns();
         let known = intent.revisions().any(ran) || current.fallback == Some(spec.digest);
-        let mut warnings = step_warnings(info, &spec, known)?;
+        let mut warnings = admission::warnings(info, &spec, known)?;
         warnings.extend(dropped.notes.iter().cloned());
         let end = |revision, unchanged, hand_over| ApplyEnd {
             id: id.clone(),

@@ -135,18 +135,7 @@ impl Deploy {
     /// The library, by name and version.
     #[must_use]
     pub fn components(&self) -> Vec<ComponentView> {
-        let mut used_by: BTreeMap<Digest, Vec<LoopId>> = BTreeMap::new();
-        for intent in self.room.book.all() {
-            let digests: std::collections::BTreeSet<Digest> =
-                [Some(&intent.current), intent.pending.as_ref(), intent.previous()]
-                    .into_iter()
-                    .flatten()
-                    .map(|s| s.digest)
-                    .collect();
-            for digest in digests {
-                used_by.entry(digest).or_default().push(intent.loop_id.clone());
-            }
-        }
+        let mut used_by = self.room.book.users();
         let mut ready_on: BTreeMap<Digest, Vec<HostId>> = BTreeMap::new();
         for (host, seen) in self.room.roster.all() {
             for digest in seen.vitals.filter(|_| seen.there).into_iter().flat_map(|v| v.ready) {

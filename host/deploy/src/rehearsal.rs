@@ -15,6 +15,7 @@ use std::{collections::BTreeMap, sync::Arc};
 use bumpless_core::{
     Cycle, Descriptor, Event, Fault, Frame, LoopId, LoopSpec, Reading, Record, Wiring, guard,
     indices::{Indices, Rule, TotalVariation},
+    seat,
     swap::{self, HandOver},
 };
 use bumpless_engine::{Instance, Origin};
@@ -125,6 +126,8 @@ pub(crate) struct Rehearsal {
     known: BTreeMap<u64, Option<Known>>,
     last: Option<Arc<Record>>,
     state: Option<Vec<u8>>,
+    /// The next first state is made from the actuators, whatever the recorded one is.
+    anew: bool,
     wanted: Vec<f64>,
     taken_over_by: Option<&'static str>,
     anchored_anew: u64,
@@ -168,6 +171,7 @@ impl Rehearsal {
             known: BTreeMap::new(),
             last: None,
             state: None,
+            anew: false,
             wanted: Vec::new(),
             taken_over_by: None,
             anchored_anew: 0,
@@ -231,7 +235,15 @@ impl Rehearsal {
                 .indices
                 .add(record.at_ns as f64 * 1e-9, record.setpoint, measurement);
         }
-        if self.candidate.held.wiring.bad_input(&readings).is_some() {
+        // As its own controller, the candidate starts from the actuator when a person lets go of it.
+        let ours = &self.candidate.held.wiring;
+        let released = base.revision == record.revision
+            && seat::released(&recorded.wiring.remap(&base.readings, ours), &readings, ours);
+        if released {
+            self.state = None;
+        }
+        self.anew |= released;
+        if ours.bad_input(&readings).is_some() {
             self.held += 1;
             return;
         }
@@ -258,11 +270,14 @@ impl Rehearsal {
         let (state, first) = match self.state.take() {
             Some(state) => (state, false),
             None => {
-                let origin = if base.revision == record.revision {
+                let origin = if self.anew {
+                    None
+                } else if base.revision == record.revision {
                     Some(recorded.clone())
                 } else {
                     self.known(base)
                 };
+                self.anew = false;
                 let (state, by) = take_over(&mut self.candidate.held, origin.as_ref(), &base.state, &held)?;
                 self.taken_over_by.get_or_insert(by);
                 self.wanted.clone_from(&held);
@@ -300,14 +315,7 @@ impl Rehearsal {
     fn compare(&mut self, record: &Record, recorded: &Known, measurement: f64, first: Option<Vec<f64>>) {
         let ours = &self.candidate.held.wiring;
         let theirs = &recorded.wiring;
-        let point = |wiring: &Wiring, output: usize| {
-            let port = wiring.outputs.get(output)?;
-            wiring.points.get(usize::from(*port)).cloned().flatten()
-        };
-        let same = |output: usize| {
-            let wanted = point(ours, output)?;
-            (0..theirs.outputs.len()).find(|other| point(theirs, *other).as_ref() == Some(&wanted))
-        };
+        let same = |output: usize| ours.same_output(output, theirs);
         // Beyond the limits no difference reaches the actuator.
         let through = |wiring: &Wiring, values: &[f64], output: usize| {
             let (value, limit) = (values.get(output)?, wiring.limits.get(output)?);

@@ -8,7 +8,7 @@ use std::{
     sync::Arc,
 };
 
-use bumpless_core::{Effects, Event, LoopId, Record, Wiring};
+use bumpless_core::{Effects, Event, LoopId, Record, Wiring, seat};
 use bumpless_loops::HeldRevision;
 
 use crate::{
@@ -125,9 +125,9 @@ impl Replay {
 /// Makes a recorded step again. Says in words what came out otherwise.
 fn again(held: &mut HeldRevision, base: Option<&Record>, record: &Record) -> Result<(), String> {
     let actuators = held.wiring.held_since(&record.readings, base, held.spec.revision);
-    let carried = base.filter(|r| r.digest == held.spec.digest && !r.state.is_empty());
+    let carried = seat::carried(base, &held.spec, &held.wiring, &record.readings);
     let state: Arc<[u8]> = match carried {
-        Some(base) => Arc::clone(&base.state),
+        Some(state) => Arc::clone(state),
         // As its owner did: a first state from what the actuators held.
         None => {
             let track = track(&held.wiring, &record.readings);
@@ -139,14 +139,13 @@ fn again(held: &mut HeldRevision, base: Option<&Record>, record: &Record) -> Res
         .instance
         .step(&frame(record, record.readings.clone()), &state, STEP_LIMIT_NS)
         .map_err(|fault| format!("the step fails now: {fault}"))?;
-    let before = base.filter(|r| r.wanted.len() == actuators.len());
-    let before = before.map_or(actuators.as_slice(), |r| r.wanted.as_slice());
+    let before = held.wiring.wanted_since(base, &actuators, held.spec.revision);
     let names = |output: usize| {
         let port = held.wiring.outputs.get(output).copied().unwrap_or_default();
         let port = held.descriptor.ports.get(usize::from(port));
         port.map_or_else(|| output.to_string(), |port| port.name.clone())
     };
-    difference(&held.wiring, &names, before, &effects, record).map_or(Ok(()), Err)
+    difference(&held.wiring, &names, &before, &effects, record).map_or(Ok(()), Err)
 }
 
 fn difference(

@@ -220,7 +220,7 @@ impl Room {
     pub(crate) async fn remove_component(&self, reference: &str) -> Result<(), Error> {
         let _admission = self.admission.lock().await;
         let info = self.library.resolve(reference)?;
-        let users = self.book.users_of(&info.digest);
+        let users = self.book.users().remove(&info.digest).unwrap_or_default();
         if !users.is_empty() {
             let names = users
                 .iter()
@@ -230,7 +230,8 @@ impl Room {
                 .join(", ");
             return Err(Error::refused(
                 format!("component {} is used by {} loops: {names}", title(&info), users.len()),
-                "swap or delete them; a loop also keeps the component that it can go back to",
+                "swap or delete them; a loop also needs the components of its earlier revisions (at most 16) and of their fallbacks, so \
+                 that each can be gone back to",
             ));
         }
         let at_ms = self.clock.unix_ms().max(info.uploaded_at_unix_ms);

@@ -14,8 +14,8 @@ use crate::{
 
 /// The package of the interfaces.
 const PACKAGE: &str = "bumpless:control/";
-/// Interfaces that a controller may import.
-const OFFERED: [&str; 6] = ["types", "io", "timer", "net", "alarm", "log"];
+/// Interfaces of `bumpless:control` that a controller may import, by their short names. There are no others.
+pub const INTERFACES: [&str; 6] = ["types", "io", "timer", "net", "alarm", "log"];
 /// The interface that it must export, with its functions.
 const EXPORT: &str = "bumpless:control/control@0.1.0";
 const FUNCTIONS: [&str; 4] = ["describe", "start", "step", "migrate"];
@@ -77,7 +77,7 @@ pub(crate) fn check_imports(component: &Component) -> Result<Vec<String>, Error>
         let interface = name
             .strip_prefix(PACKAGE)
             .map(|rest| rest.split('@').next().unwrap_or(rest));
-        if !interface.is_some_and(|i| OFFERED.contains(&i)) {
+        if !interface.is_some_and(|i| INTERFACES.contains(&i)) {
             return Err(Error::Import {
                 name: name.chars().take(128).collect(),
                 cure: cure(name),

@@ -35,7 +35,7 @@ mod profile;
 mod sandbox;
 mod ticker;
 
-pub use admission::Inspection;
+pub use admission::{INTERFACES, Inspection};
 pub use cache::cache_key;
 pub use capacity::Capacity;
 pub use compile::precompile;

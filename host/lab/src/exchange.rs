@@ -37,6 +37,7 @@ impl World<'_> {
                 running.revision = tried.index;
                 running.frame.readings.clone_from(&tried.readings);
                 running.sample.readings = tried.readings;
+                running.standing.manual = tried.manual;
                 running.state = tried.state;
                 let step = Stepped {
                     effects: tried.effects,
@@ -114,20 +115,11 @@ impl World<'_> {
             .instance
             .step(&frame, &state, CALL_NS_MAX)
             .map_err(|fault| fault.to_string())?;
-        let manual = if manual.len() == actuators.len() {
-            manual
-        } else {
-            &actuators
-        };
+        let (old, new) = (&l.held[running.revision], &l.held[index]);
+        let manual = new.wiring.outputs_from(manual, &old.wiring, &actuators);
         let wanted = new.wiring.wanted(&effects.writes, &actuators);
-        let outputs = guard::guard(mode, &wanted, manual, &actuators, &new.wiring.limits, dt_ns).outputs;
-        let spans: Vec<f64> = (0..outputs.len()).map(|i| new.wiring.span(i)).collect();
-        let compared = if old_outputs.len() == outputs.len() {
-            &old_outputs
-        } else {
-            &actuators
-        };
-        let bump_percent = swap::bump_percent(compared, &outputs, &spans);
+        let outputs = guard::guard(mode, &wanted, &manual, &actuators, &new.wiring.limits, dt_ns).outputs;
+        let bump_percent = swap::bump_between((&old.wiring, &old_outputs), (&new.wiring, &outputs), &actuators);
         let policy = &new.spec.policy;
         if bump_percent > policy.bump_limit_percent && policy.on_bump == OnBump::Refuse {
             return Err(format!(
@@ -138,6 +130,7 @@ impl World<'_> {
         Ok(Tried {
             index,
             readings,
+            manual,
             state,
             effects,
             by,
@@ -150,6 +143,8 @@ impl World<'_> {
 struct Tried {
     index: usize,
     readings: Vec<Reading>,
+    /// The operator's outputs, in its order.
+    manual: Vec<f64>,
     state: Arc<[u8]>,
     effects: Effects,
     by: &'static str,

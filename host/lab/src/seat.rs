@@ -220,11 +220,9 @@ impl World<'_> {
         let frame = seat::frame(base.as_deref(), &held.spec, &standing, &sample, sample.readings.clone());
         let mut events = Vec::new();
         let bad_input = held.wiring.bad_input(&sample.readings);
-        let carried = base
-            .as_ref()
-            .filter(|r| r.digest == held.spec.digest && !r.state.is_empty());
+        let carried = seat::carried(base.as_deref(), &held.spec, &held.wiring, &sample.readings);
         let state: Result<Arc<[u8]>, Fault> = match carried {
-            Some(record) => Ok(Arc::clone(&record.state)),
+            Some(state) => Ok(Arc::clone(state)),
             None => held.take_over(None, &actuators).map(|(state, _)| Arc::from(state)),
         };
         let fault = match (&state, bad_input) {

@@ -51,16 +51,6 @@ pub(crate) fn track(held: &HeldRevision, readings: &[Reading]) -> Vec<f64> {
         .collect()
 }
 
-/// The output of another revision that drives the same point.
-fn same_output(held: &HeldRevision, output: usize, other: &HeldRevision) -> Option<usize> {
-    let point = |held: &HeldRevision, output: usize| {
-        let port = held.wiring.outputs.get(output)?;
-        held.wiring.points.get(usize::from(*port)).cloned().flatten()
-    };
-    let wanted = point(held, output)?;
-    (0..other.wiring.outputs.len()).find(|i| point(other, *i).as_ref() == Some(&wanted))
-}
-
 fn origin(held: &HeldRevision) -> Origin {
     Origin {
         name: held.descriptor.name.clone(),
@@ -105,9 +95,11 @@ impl Worker {
             origin(&seat.held[new]),
             swap::hand_over(&seat.held[new].spec, &seat.held[old].spec),
         );
+        let actuators = track(&seat.held[old], &readings);
+        let (left, back) = (&seat.held[new].wiring, &seat.held[old].wiring);
+        running.standing.manual = back.outputs_from(&running.standing.manual, left, &actuators);
         let held = &mut seat.held[old];
         let limit_ns = held.spec.step_limit_ns();
-        let actuators = track(held, &readings);
         let frame = Frame {
             readings: readings.clone(),
             ..running.frame.clone()
@@ -170,7 +162,9 @@ impl Worker {
         let now = &seat.held[new];
         for (i, value) in wanted.iter().enumerate() {
             let name = || now.descriptor.ports[usize::from(now.wiring.outputs[i])].name.clone();
-            let Some(j) = same_output(now, i, before) else { continue };
+            let Some(j) = now.wiring.same_output(i, &before.wiring) else {
+                continue;
+            };
             if outside(now, &wanted, i) && !outside(before, &usual, j) {
                 let OutputLimit { low, high, .. } = now.wiring.limits[i];
                 return Some(Fault::Probation(format!(
@@ -255,9 +249,7 @@ impl Worker {
                 let spec = &seat.held[tried.index].spec;
                 let probation = (spec.policy.probation_cycles > 0 && tried.by != "same")
                     .then_some((running.sample.revision, spec.policy.probation_cycles));
-                if running.standing.manual.len() != spec_outputs(&seat.held[tried.index]) {
-                    running.standing.manual = track(&seat.held[tried.index], &tried.readings);
-                }
+                running.standing.manual = tried.manual;
                 running.state = tried.state;
                 let step = Ok(Stepped {
                     effects: tried.effects,
@@ -281,16 +273,14 @@ impl Worker {
 struct Tried {
     index: usize,
     readings: Vec<Reading>,
+    /// The operator's outputs, in its order.
+    manual: Vec<f64>,
     state: Arc<[u8]>,
     effects: Effects,
     by: &'static str,
     bump_percent: f64,
     /// The loop's limit, where the bump is beyond it and the policy lets it pass.
     over_percent: Option<f64>,
-}
-
-fn spec_outputs(held: &HeldRevision) -> usize {
-    held.wiring.outputs.len()
 }
 
 /// Hands the state over, steps the new component on the same frame and measures the bump. Says in words why not.
@@ -343,17 +333,12 @@ fn try_revision(
         .step(&frame, &state, limit_ns)
         .map_err(|fault| format!("its first step failed: {fault}"))?;
     let wanted = new.wiring.wanted(&effects.writes, &actuators);
-    let manual = if running.standing.manual.len() == actuators.len() {
-        &running.standing.manual
-    } else {
-        &actuators
-    };
-    let new_outputs = guard::guard(mode, &wanted, manual, &actuators, &new.wiring.limits, dt_ns).outputs;
-    let spans: Vec<f64> = (0..new_outputs.len()).map(|i| new.wiring.span(i)).collect();
-    // Outputs that the old component did not drive are compared with what their actuators hold.
-    let same_ports = old_outputs.len() == new_outputs.len();
-    let compared = if same_ports { &old_outputs } else { &actuators };
-    let bump_percent = swap::bump_percent(compared, &new_outputs, &spans);
+    let (old, new) = (&seat.held[old_index], &seat.held[new_index]);
+    let manual = new
+        .wiring
+        .outputs_from(&running.standing.manual, &old.wiring, &actuators);
+    let new_outputs = guard::guard(mode, &wanted, &manual, &actuators, &new.wiring.limits, dt_ns).outputs;
+    let bump_percent = swap::bump_between((&old.wiring, &old_outputs), (&new.wiring, &new_outputs), &actuators);
     let limit = new.spec.policy.bump_limit_percent;
     let over_percent = (bump_percent > limit).then_some(limit);
     if over_percent.is_some() && new.spec.policy.on_bump == OnBump::Refuse {
@@ -365,6 +350,7 @@ fn try_revision(
     Ok(Tried {
         index: new_index,
         readings,
+        manual,
         state,
         effects,
         by,

@@ -255,11 +255,9 @@ impl Worker {
         let frame = seat::frame(base.as_deref(), &held.spec, &standing, &sample, sample.readings.clone());
         let mut events = Vec::new();
         let bad_input = held.wiring.bad_input(&sample.readings);
-        let carried = base
-            .as_ref()
-            .filter(|r| r.digest == held.spec.digest && !r.state.is_empty());
+        let carried = seat::carried(base.as_deref(), &held.spec, &held.wiring, &sample.readings);
         let state: Result<Arc<[u8]>, Fault> = match carried {
-            Some(record) => Ok(Arc::clone(&record.state)),
+            Some(state) => Ok(Arc::clone(state)),
             None => take_over(held, None, &actuators, limit_ns).map(|(state, _)| Arc::from(state)),
         };
         // The same cycle in all but its number: last time its end came too late for its commit, and no record says so yet.

@@ -416,3 +416,75 @@ fn an_outage_or_a_date_that_was_set_is_no_time_to_control() {
     };
     assert_eq!(dt_ns(Some(&slow), &faster, &sample), spec.period_ns);
 }
+
+#[test]
+fn an_output_that_a_person_let_go_of_starts_the_law_from_the_actuator() {
+    let (spec, wiring) = setup();
+    let as_read = |pv: Quality, out: Quality| -> Vec<Reading> {
+        let read = |value: f64, quality| Reading {
+            quality,
+            ..Reading::good(value, 5)
+        };
+        vec![read(4.0, pv), read(42.0, out)]
+    };
+    let (good, forced) = (Quality::Good, Quality::Forced);
+    let record = |readings: Vec<Reading>| Record {
+        state: Arc::from([7]),
+        readings,
+        ..before()
+    };
+    let carries = |base: &Record, now: &[Reading]| carried(Some(base), &spec, &wiring, now).is_some();
+    let free = as_read(good, good);
+    for (before, now, goes_on) in [
+        (free.clone(), free.clone(), true),
+        (free.clone(), as_read(good, forced), true),
+        (as_read(good, forced), as_read(good, forced), true),
+        (as_read(good, forced), free.clone(), false),
+        (as_read(good, forced), as_read(good, Quality::Bad), false),
+        // An input that is let go of is a measurement that changed.
+        (as_read(forced, good), free.clone(), true),
+    ] {
+        assert_eq!(
+            carries(&record(before.clone()), &now),
+            goes_on,
+            "{before:?} then {now:?}"
+        );
+    }
+    // The first record after it is free again, and its state is the one that started there.
+    let next = record(free.clone());
+    assert!(carries(&next, &free));
+    let strange = Record {
+        digest: Digest::of(b"other"),
+        ..next.clone()
+    };
+    let empty = Record {
+        state: Arc::from([]),
+        ..next
+    };
+    assert!(!carries(&strange, &free) && !carries(&empty, &free));
+    assert!(carried(None, &spec, &wiring, &free).is_none());
+}
+
+#[test]
+fn what_another_revision_wanted_says_nothing_about_an_output_that_is_not_written() {
+    let (mut spec, _) = setup();
+    let base = Record {
+        wanted: vec![77.0],
+        ..before()
+    };
+    let silent = || {
+        Ok(Stepped {
+            effects: Effects::default(),
+            by: host(1),
+            step_ns: 3,
+        })
+    };
+    let standing = || settle(Some(&base), &setup().0, &sample(vec![]), &[42.0]);
+    assert_eq!(conclude_with(silent(), standing(), &base, &spec).wanted, [77.0]);
+    spec.revision = 2;
+    assert_eq!(
+        conclude_with(silent(), standing(), &base, &spec).wanted,
+        [42.0],
+        "what is held"
+    );
+}

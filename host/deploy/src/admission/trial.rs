@@ -14,7 +14,7 @@ use std::{
 };
 
 use bumpless_core::{
-    Effects, Fault, Finding, Frame, Migrated, Severity,
+    Descriptor, Effects, Fault, Finding, Frame, Migrated, Severity,
     admission::FINDINGS_MAX,
     limits::{LOG_LINES_PER_STEP_MAX, TEXT_CHARS_MAX},
 };
@@ -100,6 +100,8 @@ struct Run<'a> {
     own_from_ns: u64,
     told: BTreeSet<(Kind, u8)>,
     wrote: bool,
+    /// The longest step so far.
+    worst_ns: u64,
     trial: Trial,
 }
 
@@ -116,6 +118,7 @@ pub(crate) fn run(prepared: &Arc<Prepared>) -> Trial {
         own_from_ns: own_ns(),
         told: BTreeSet::new(),
         wrote: false,
+        worst_ns: 0,
         trial: Trial {
             cycles: 0,
             steps_ns: Vec::new(),
@@ -266,7 +269,7 @@ impl Run<'_> {
         }
         if self.trial.cycles.is_multiple_of(AGAIN_EVERY) {
             let again = self.instance()?.step(frame, &state, TRIAL_STEP_LIMIT_NS);
-            if let Some(what) = self.difference(&end, &again) {
+            if let Some(what) = difference(self.prepared.descriptor(), &end, &again) {
                 return Err(self.refuse(format!(
                     "stepped twice from the same state on the same frame {} it gave two answers: {what}; a component \
                      must keep nothing between calls, for any replica may step",
@@ -277,6 +280,7 @@ impl Run<'_> {
         match end {
             Ok(effects) => {
                 if kind.is_good() && self.trial.cycles > WARM_UP {
+                    let ns = self.worst_again(used, frame, &state, ns);
                     self.trial.steps_ns.push(ns);
                 }
                 self.wrote |= !effects.writes.is_empty();
@@ -300,6 +304,18 @@ impl Run<'_> {
         }
     }
 
+    /// The time of a step. One that is longer than all before is measured once more, and the shorter time counts: the same step
+    /// does the same work, so what it took less the second time was the machine's, and the longest step keeps components out.
+    fn worst_again(&mut self, used: &mut Instance, frame: &Frame, state: &[u8], ns: u64) -> u64 {
+        if self.worst_ns >= ns {
+            return ns;
+        }
+        let (end, again_ns) = measured(|| used.step(frame, state, TRIAL_STEP_LIMIT_NS));
+        let ns = if end.is_ok() { ns.min(again_ns) } else { ns };
+        self.worst_ns = self.worst_ns.max(ns);
+        ns
+    }
+
     fn judge(&mut self, kind: Kind, fault: &Fault) -> Result<(), Over> {
         let text = format!("{} {fault}", kind.words());
         if kind.is_good() && !in_words(fault) {
@@ -313,55 +329,6 @@ impl Run<'_> {
             self.find(severity, text);
         }
         Ok(())
-    }
-
-    /// How two ends of the same step differ.
-    fn difference(&self, first: &Result<Effects, Fault>, again: &Result<Effects, Fault>) -> Option<String> {
-        // An overrun is told by a clock, which is never the same twice.
-        let overran = |end: &Result<Effects, Fault>| matches!(end, Err(Fault::Overrun { .. }));
-        if overran(first) || overran(again) {
-            return None;
-        }
-        let (first, again) = match (first, again) {
-            (Ok(first), Ok(again)) => (first, again),
-            (Err(first), Err(again)) => {
-                let different = sort(first) != sort(again);
-                return different.then(|| format!("first {first}, then {again}"));
-            }
-            (Ok(_), Err(fault)) => return Some(format!("first it was good, then {fault}")),
-            (Err(fault), Ok(_)) => return Some(format!("first {fault}, then it was good")),
-        };
-        let port = |number: u8| {
-            let ports = &self.prepared.descriptor().ports;
-            ports
-                .get(usize::from(number))
-                .map_or_else(|| number.to_string(), |port| port.name.clone())
-        };
-        let bits = |writes: &[(u8, f64)]| writes.iter().map(|(p, v)| (*p, v.to_bits())).collect::<Vec<_>>();
-        if bits(&first.writes) != bits(&again.writes) {
-            let list = |writes: &[(u8, f64)]| {
-                let list: Vec<String> = writes.iter().map(|(p, v)| format!("{} = {v}", port(*p))).collect();
-                if list.is_empty() {
-                    "nothing".to_owned()
-                } else {
-                    list.join(", ")
-                }
-            };
-            return Some(format!(
-                "it wrote {}, then {}",
-                list(&first.writes),
-                list(&again.writes)
-            ));
-        }
-        if first.state != again.state {
-            let at = first.state.iter().zip(&again.state).take_while(|(a, b)| a == b).count();
-            let (a, b) = (first.state.len(), again.state.len());
-            return Some(format!("states of {a} and {b} bytes that differ from byte {at} on"));
-        }
-        if first.messages != again.messages {
-            return Some("other messages".to_owned());
-        }
-        (first.alarms != again.alarms).then(|| "other alarms".to_owned())
     }
 
     /// What grew although nothing new happened.
@@ -436,5 +403,142 @@ impl Run<'_> {
             ),
         }
         Ok(())
+    }
+}
+
+/// How two ends of the same step differ.
+fn difference(
+    descriptor: &Descriptor,
+    first: &Result<Effects, Fault>,
+    again: &Result<Effects, Fault>,
+) -> Option<String> {
+    // An overrun is told by a clock, which is never the same twice.
+    let overran = |end: &Result<Effects, Fault>| matches!(end, Err(Fault::Overrun { .. }));
+    if overran(first) || overran(again) {
+        return None;
+    }
+    let (first, again) = match (first, again) {
+        (Ok(first), Ok(again)) => (first, again),
+        (Err(first), Err(again)) => {
+            let different = sort(first) != sort(again);
+            return different.then(|| format!("first {first}, then {again}"));
+        }
+        (Ok(_), Err(fault)) => return Some(format!("first it was good, then {fault}")),
+        (Err(fault), Ok(_)) => return Some(format!("first {fault}, then it was good")),
+    };
+    let port = |number: u8| {
+        descriptor
+            .ports
+            .get(usize::from(number))
+            .map_or_else(|| number.to_string(), |port| port.name.clone())
+    };
+    let bits = |writes: &[(u8, f64)]| writes.iter().map(|(p, v)| (*p, v.to_bits())).collect::<Vec<_>>();
+    if bits(&first.writes) != bits(&again.writes) {
+        let list = |writes: &[(u8, f64)]| {
+            let list: Vec<String> = writes.iter().map(|(p, v)| format!("{} = {v}", port(*p))).collect();
+            if list.is_empty() {
+                "nothing".to_owned()
+            } else {
+                list.join(", ")
+            }
+        };
+        return Some(format!(
+            "it wrote {}, then {}",
+            list(&first.writes),
+            list(&again.writes)
+        ));
+    }
+    if first.state != again.state {
+        let at = first.state.iter().zip(&again.state).take_while(|(a, b)| a == b).count();
+        let (a, b) = (first.state.len(), again.state.len());
+        return Some(format!("states of {a} and {b} bytes that differ from byte {at} on"));
+    }
+    // What a vote and a replay compare must be compared here, or a component passes its trial and then dissents from itself.
+    [
+        ("other messages", first.messages == again.messages),
+        ("other alarms", first.alarms == again.alarms),
+        ("other log lines", first.log == again.log),
+    ]
+    .into_iter()
+    .find_map(|(what, equal)| (!equal).then(|| what.to_owned()))
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "tests")]
+
+    use bumpless_core::{AlarmChange, Message, vote::Cast};
+
+    use super::*;
+
+    #[test]
+    fn whatever_a_vote_would_tell_apart_a_trial_does_too() {
+        let descriptor = Descriptor {
+            name: "law".to_owned(),
+            version: "1.0.0".to_owned(),
+            text: String::new(),
+            ports: vec![],
+            parameters: vec![],
+            state_layout: 1,
+        };
+        let good = Effects {
+            writes: vec![(1, 0.5)],
+            state: vec![1, 2],
+            ..Effects::default()
+        };
+        let end = |spoil: &dyn Fn(&mut Effects)| {
+            let mut effects = good.clone();
+            spoil(&mut effects);
+            Ok(effects)
+        };
+        let line = |text: &str| bumpless_core::LogLine {
+            level: bumpless_core::LogLevel::Info,
+            text: text.to_owned(),
+        };
+        let first: Result<Effects, Fault> = end(&|_| {});
+        assert_eq!(difference(&descriptor, &first, &end(&|_| {})), None);
+        type Spoil<'a> = &'a dyn Fn(&mut Effects);
+        let table: [(Spoil<'_>, &str); 6] = [
+            (&|e| e.writes[0].1 = -0.5, "it wrote 1 = 0.5, then 1 = -0.5"),
+            (&|e| e.writes.clear(), "it wrote 1 = 0.5, then nothing"),
+            (
+                &|e| e.state[1] = 3,
+                "states of 2 and 2 bytes that differ from byte 1 on",
+            ),
+            (
+                &|e| {
+                    e.messages.push(Message {
+                        topic: "t".to_owned(),
+                        data: vec![],
+                    });
+                },
+                "other messages",
+            ),
+            (
+                &|e| {
+                    e.alarms.push(AlarmChange {
+                        name: "a".to_owned(),
+                        raised: None,
+                    });
+                },
+                "other alarms",
+            ),
+            (&|e| e.log.push(line("call 7")), "other log lines"),
+        ];
+        for (spoil, words) in table {
+            let again = end(spoil);
+            assert!(!Cast::of(first.clone()).same(&Cast::of(again.clone())), "{words}");
+            assert_eq!(difference(&descriptor, &first, &again).unwrap(), words);
+        }
+        let failed = Err(Fault::Failed("no".to_owned()));
+        assert!(
+            difference(&descriptor, &first, &failed)
+                .unwrap()
+                .starts_with("first it was good, then")
+        );
+        assert_eq!(
+            difference(&descriptor, &first, &Err(Fault::Overrun { limit_us: 1 })),
+            None
+        );
     }
 }

@@ -77,3 +77,36 @@ async fn a_component_in_use_stays() {
     io.deploy.upload(component("pid"), "t", "").await.unwrap();
     io.stop().await;
 }
+
+#[tokio::test(flavor = "multi_thread")]
+async fn every_revision_that_can_be_gone_back_to_keeps_its_components() {
+    let cell = Cell::new();
+    let io = cell.io("io", true).await;
+    for name in ["pid", "pidplus", "on-off", "ratio"] {
+        io.deploy.upload(component(name), "t", "").await.unwrap();
+    }
+    let mut first = draft("l", "pid", "io", 1);
+    first.fallback = Some("pidplus".to_owned());
+    io.deploy.apply(first).await.unwrap();
+    for hysteresis in [1.0, 2.0, 3.0] {
+        let mut next = draft("l", "on-off", "io", 1);
+        next.parameters.insert("hysteresis".to_owned(), hysteresis);
+        // Too slow a component is not what this is about.
+        next.policy.step_limit_us = 10_000;
+        io.deploy.apply(next).await.unwrap();
+    }
+    // pid is three revisions back and pidplus its fallback; ratio is nobody's. The list says what the guard does.
+    for (name, used) in [("pid", true), ("pidplus", true), ("on-off", true), ("ratio", false)] {
+        let views = io.deploy.components();
+        let view = views.iter().find(|view| view.info.name == name).unwrap();
+        assert_eq!(!view.used_by.is_empty(), used, "{name}: {:?}", view.used_by);
+        match io.deploy.remove_component(name).await {
+            Ok(()) => assert!(!used, "{name}"),
+            Err(Error::Refused(words)) => assert!(used && words.cure.contains("gone back to"), "{name}: {words:?}"),
+            Err(error) => panic!("{name}: {error:?}"),
+        }
+    }
+    let back = io.deploy.rollback(&id("l"), Some(1)).await.unwrap();
+    assert_eq!(io.deploy.loop_view(&id("l")).unwrap().component, "pid@0.1.0", "{back:?}");
+    io.stop().await;
+}

@@ -145,7 +145,7 @@ pub(crate) fn component(name: &str) -> Vec<u8> {
 }
 
 impl Bench {
-    /// A plant host with one first-order process, and holders (the plant host itself where its name is among them).
+    /// A plant host with two first-order processes (the loop has the first), and holders (the plant host itself where its name is among them).
     pub(crate) fn new(holders: &[&str], spec: impl FnOnce(&mut LoopSpec)) -> Self {
         Self::with_errors(holders, &[], spec)
     }
@@ -159,7 +159,7 @@ impl Bench {
             .unwrap();
         let sim: SimConfig = serde_json::from_value(serde_json::json!({
             "id": "plant", "seed": 1,
-            "fopdt": { "count": 1, "gain": 1.0, "tau_s": 0.5, "dead_time_s": 0.02, "noise": 0.0 },
+            "fopdt": { "count": 2, "gain": 1.0, "tau_s": 0.5, "dead_time_s": 0.02, "noise": 0.0 },
         }))
         .unwrap();
         let clock = Clock::start();

@@ -6,6 +6,7 @@ mod acknowledged;
 mod bench;
 mod degraded;
 mod probation;
+mod rebound;
 mod votes;
 
 use std::{collections::HashSet, sync::Arc};
