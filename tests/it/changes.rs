@@ -100,10 +100,8 @@ fn structure_changes_while_the_loop_runs_each_as_one_revision_without_a_bump() {
         let record = feed.record_where(what, |r| whole(&r["revision"]) == expected).unwrap();
         assert!(event(&record, "revised").is_some(), "{what}: {record}");
         switched.push((what, whole(&record["seq"])));
-        feed.record_where("some cycles more", |r| {
-            whole(&r["seq"]) > whole(&record["seq"]) + 25
-        })
-        .unwrap();
+        feed.record_where("some cycles more", |r| whole(&r["seq"]) > whole(&record["seq"]) + 25)
+            .unwrap();
     }
     let period = api.loop_view(LOOP).unwrap();
     assert_eq!(period["past_revisions"].as_array().map(Vec::len), Some(5));
@@ -127,7 +125,10 @@ fn structure_changes_while_the_loop_runs_each_as_one_revision_without_a_bump() {
     let first = number(&record["outputs"]["out"]);
     assert!((first - held).abs() < 0.1, "{first} where {held} was held");
     let left = number(&api.point(POINT).unwrap()["value"]);
-    assert!((left - before).abs() < 0.5, "the old actuator went from {before} to {left}");
+    assert!(
+        (left - before).abs() < 0.5,
+        "the old actuator went from {before} to {left}"
+    );
     one_writer(&cell.journal().unwrap());
 }
 

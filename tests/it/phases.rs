@@ -115,7 +115,10 @@ fn ready(api: &Api) -> Value {
 fn dies_in(cell: &mut Cell, api: &Api, phase: &Phase) {
     let before = ready(api);
     let owner = text(&before["owner"]);
-    let standby = names(&before["members"]).into_iter().find(|name| *name != owner).unwrap();
+    let standby = names(&before["members"])
+        .into_iter()
+        .find(|name| *name != owner)
+        .unwrap();
     let scene = Scene {
         api: api.clone(),
         owner_api: cell.api_of(&owner).unwrap(),
@@ -162,7 +165,11 @@ fn reach(cell: &mut Cell, phase: &Phase, scene: &Scene, standby: &str) -> JoinHa
             if look(cell) && (phase.is_on)(scene) && !asked.is_finished() {
                 return asked;
             }
-            assert!(started.elapsed() < PATIENCE, "{}: never on; ends so far: {ends:?}", phase.name);
+            assert!(
+                started.elapsed() < PATIENCE,
+                "{}: never on; ends so far: {ends:?}",
+                phase.name
+            );
             pause(Duration::from_millis(1));
         }
         // Over before anybody looked; what only reads can be asked for again, and everything else ends here.
@@ -218,7 +225,11 @@ fn there_or_not(scene: &Scene, name: &str) {
         .send("GET", &format!("/v1/components/{name}/bytes"), &[], &[])
         .unwrap();
     let file = bumpless_tests::components().unwrap().join(format!("{name}.wasm"));
-    assert!(bytes.status == 200 && bytes.body == fs::read(file).unwrap(), "{}", bytes.status);
+    assert!(
+        bytes.status == 200 && bytes.body == fs::read(file).unwrap(),
+        "{}",
+        bytes.status
+    );
 }
 
 fn cascade() -> Value {
@@ -305,7 +316,10 @@ fn of_a_look_at_what_was_recorded() {
             freeze: None,
             holds: |scene, end| {
                 let report = end.as_ref().unwrap();
-                assert!(whole(&report["compared"]) > 190 && report["first_fault"].is_null(), "{report}");
+                assert!(
+                    whole(&report["compared"]) > 190 && report["first_fault"].is_null(),
+                    "{report}"
+                );
                 unchanged(scene);
             },
         },
@@ -316,7 +330,10 @@ fn of_a_look_at_what_was_recorded() {
             freeze: None,
             holds: |scene, end| {
                 let report = end.as_ref().unwrap();
-                assert!(whole(&report["compared"]) > 190 && report["compared"] == report["equal"], "{report}");
+                assert!(
+                    whole(&report["compared"]) > 190 && report["compared"] == report["equal"],
+                    "{report}"
+                );
                 unchanged(scene);
             },
         },
@@ -452,7 +469,9 @@ fn of_a_canary() {
             for one in end["loops"].as_array().unwrap() {
                 let view = scene
                     .api
-                    .wait_for_loop(&text(&one["loop"]), "nothing pending", |v| v["pending_revision"].is_null())
+                    .wait_for_loop(&text(&one["loop"]), "nothing pending", |v| {
+                        v["pending_revision"].is_null()
+                    })
                     .unwrap();
                 let runs = if one["stage"] == "done" { "pidplus@" } else { "pid@" };
                 assert!(text(&view["component"]).starts_with(runs), "{one}: {view}");

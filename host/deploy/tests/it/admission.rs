@@ -150,7 +150,11 @@ async fn what_a_component_imports_is_compared_with_what_the_loop_grants() {
     let io = cell.io("io", true).await;
     io.deploy.upload(component("pid"), "t", "").await.unwrap();
     let floods = forced(&io, "guests/floods-messages").await;
-    assert!(floods.imports.iter().any(|import| import.contains("/net@")), "{:?}", floods.imports);
+    assert!(
+        floods.imports.iter().any(|import| import.contains("/net@")),
+        "{:?}",
+        floods.imports
+    );
     let said = |warnings: &[String], part: &str| warnings.iter().any(|warning| warning.contains(part));
 
     let quiet = io.deploy.apply(draft("a", "pid", "io", 1)).await.unwrap();
@@ -174,6 +178,10 @@ async fn what_a_component_imports_is_compared_with_what_the_loop_grants() {
     (listens.policy.step_limit_us, listens.policy.takeover_part) = (9_000, 0.08);
     (listens.period_ms, listens.policy.hedge_part) = (100.0, 0.02);
     let late = io.deploy.apply(listens).await.unwrap();
-    assert!(said(&late.warnings, "in a later cycle, not in its own"), "{:?}", late.warnings);
+    assert!(
+        said(&late.warnings, "in a later cycle, not in its own"),
+        "{:?}",
+        late.warnings
+    );
     io.stop().await;
 }

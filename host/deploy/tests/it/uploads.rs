@@ -107,6 +107,10 @@ async fn every_revision_that_can_be_gone_back_to_keeps_its_components() {
         }
     }
     let back = io.deploy.rollback(&id("l"), Some(1)).await.unwrap();
-    assert_eq!(io.deploy.loop_view(&id("l")).unwrap().component, "pid@0.1.0", "{back:?}");
+    assert_eq!(
+        io.deploy.loop_view(&id("l")).unwrap().component,
+        "pid@0.1.0",
+        "{back:?}"
+    );
     io.stop().await;
 }
