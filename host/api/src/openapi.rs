@@ -160,6 +160,29 @@ mod tests {
         assert!(lost.is_empty(), "{lost:?}");
     }
 
+    #[test]
+    fn nothing_is_null_but_examples() {
+        fn nulls(place: &str, value: &serde_json::Value, found: &mut Vec<String>) {
+            match value {
+                serde_json::Value::Null => found.push(place.to_owned()),
+                serde_json::Value::Object(map) => {
+                    for (key, value) in map
+                        .iter()
+                        .filter(|(key, _)| !["example", "default", "enum"].contains(&key.as_str()))
+                    {
+                        nulls(&format!("{place}/{key}"), value, found);
+                    }
+                }
+                serde_json::Value::Array(rows) => rows.iter().for_each(|row| nulls(place, row, found)),
+                _ => {}
+            }
+        }
+        let document: serde_json::Value = serde_json::from_str(openapi_json()).expect("it is JSON");
+        let mut found = Vec::new();
+        nulls("", &document, &mut found);
+        assert!(found.is_empty(), "{found:?}");
+    }
+
     /// The shape of an answer: its keys, and of a list the shape of its first row.
     fn shape(value: &serde_json::Value) -> serde_json::Value {
         use serde_json::Value;

@@ -186,6 +186,8 @@ fn header(operation: &mut Value, name: &str, words: &str, example: &str) {
     let mut schema = json!({ "type": "string" });
     if name == "Idempotency-Key" {
         schema["pattern"] = json!("^[0-9a-f]{1,32}$|^[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}$");
+    } else {
+        schema["pattern"] = json!(r#"^(\*|"[!#-~]{1,64}")$"#);
     }
     parameters.push(json!({
         "name": name, "in": "header", "required": false, "description": words, "schema": schema, "example": example,
@@ -281,7 +283,9 @@ fn examples(path: &str, id: &str, operation: &mut Value) {
     let Some(example) = ALL_EXAMPLES.get(id) else { return };
     let asked = example["path"].as_str().unwrap_or_default();
     let (asked, query) = asked.split_once('?').unwrap_or((asked, ""));
-    for parameter in operation["parameters"].as_array_mut().into_iter().flatten() {
+    // Looked up, not indexed: an index would put a null where there is nothing.
+    let parameters = operation.get_mut("parameters").and_then(Value::as_array_mut);
+    for parameter in parameters.into_iter().flatten() {
         let name = parameter["name"].as_str().unwrap_or_default().to_owned();
         let placed = match parameter["in"].as_str() {
             Some("path") => {
@@ -304,18 +308,14 @@ fn examples(path: &str, id: &str, operation: &mut Value) {
         }
     }
     if let Some(request) = example.get("request") {
-        for content in operation["requestBody"]["content"]
-            .as_object_mut()
-            .into_iter()
-            .flatten()
-        {
-            content.1["example"] = request.clone();
+        let content = operation.pointer_mut("/requestBody/content");
+        for (_, content) in content.and_then(Value::as_object_mut).into_iter().flatten() {
+            content["example"] = request.clone();
         }
     }
-    let status = example["status"].to_string();
     if let Some(answer) = example.get("answer") {
-        let content = &mut operation["responses"][status]["content"];
-        for (_, content) in content.as_object_mut().into_iter().flatten() {
+        let content = operation.pointer_mut(&format!("/responses/{}/content", example["status"]));
+        for (_, content) in content.and_then(Value::as_object_mut).into_iter().flatten() {
             content["example"] = answer.clone();
         }
     }
