@@ -239,8 +239,9 @@ mod tests {
     fn conditions_mean_what_the_standard_says() {
         let (yes, no) = (header::IF_MATCH, header::IF_NONE_MATCH);
         let tag = Tag::revision(7);
-        // The header, does the reader have r7, may r7 be changed, may nothing be made.
-        let table: [(&[(HeaderName, &str)], bool, bool, bool); 9] = [
+        /// The header, does the reader have r7, may r7 be changed, may nothing be made.
+        type Row<'a> = (&'a [(HeaderName, &'a str)], bool, bool, bool);
+        let table: [Row<'_>; 9] = [
             (&[], false, true, true),
             (&[(yes.clone(), "\"r7\"")], false, true, false),
             (&[(yes.clone(), "\"r6\", \"r7\"")], false, true, false),
