@@ -181,9 +181,7 @@ pub(crate) fn run(options: Options, report: &mut Report) -> Result<(), Error> {
     for (name, words, end) in &bombs {
         let refused = end.as_ref().is_ok_and(|answer| is_refusal(answer, words));
         if !refused {
-            let said = end
-                .as_ref()
-                .map_or_else(ToString::to_string, bumpless_tests::Answer::text);
+            let said = end.as_ref().map_or_else(ToString::to_string, Answer::text);
             report.progress(&format!("{name} was not refused for what it is: {said}"));
         }
         report.figure(

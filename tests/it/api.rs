@@ -85,6 +85,7 @@ fn every_answer_is_one_that_the_document_promises() {
         [[operations]]\ninclude-path-regex = \"^/v1/loops/\"\nparameters = { \"path.name\" = \"loop-0\", \"path.alarm\" = \"fault\" }\n\
         [[operations]]\ninclude-path-regex = \"^/v1/hosts/\"\nparameters = { \"path.name\" = \"plant\" }\n\
         [[operations]]\ninclude-path-regex = \"^/v1/points/\"\nparameters = { \"path.name\" = \"plant.1.out\" }\n\
+        [[operations]]\ninclude-path-regex = \"^/v1/(jobs|rollouts)/\"\nparameters = { \"path.id\" = \"plant.1\" }\n\
         [[operations]]\ninclude-path-regex = \"^/v1/components/\"\nparameters = { \"path.reference\" = \"pid\" }\n";
     fs::write(folder.path().join("schemathesis.toml"), known).unwrap();
     let examples = std::env::var("SCHEMATHESIS_EXAMPLES").unwrap_or_else(|_| EXAMPLES.to_string());

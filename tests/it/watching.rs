@@ -26,7 +26,7 @@ fn parse(text: &str) -> BTreeMap<String, f64> {
         let (name, value) = line.rsplit_once(' ').expect(line);
         let value: f64 = value.parse().expect(line);
         let family = name.split('{').next().expect(line);
-        let ends = ["_total", "_bucket", "_count", "_sum"];
+        let ends = ["_total", "_bucket", "_count", "_sum", "_info"];
         let declared = types.contains_key(family)
             || ends
                 .iter()

@@ -26,8 +26,8 @@ pub use alarms::{
 pub use call::{CallAnswer, CallRequest};
 pub use component::{Component, Components, Parameter, Port};
 pub use field::{
-    Block, Bus, Buses, ByRequest, FieldNews, Force, ForceRequest, Job, JobRequest, JobState, Jobs, NamedJob, ReadBlock,
-    Redundant, ScanRequest, Table, WriteBlock, WriteRequest,
+    Block, Bus, Buses, ByRequest, FieldNews, Force, ForceRequest, Job, JobRequest, JobState, Jobs, NamedJob,
+    PointForced, PointUnforced, PointWritten, ReadBlock, Redundant, ScanRequest, Table, WriteBlock, WriteRequest,
 };
 pub use history::{
     BacktestRequest, CurvePoint, CycleFinding, Cycles, LoopIndices, OutputTrial, Replay, ReplayRequest, Shadow,

@@ -184,22 +184,18 @@ fn late_limit(spec: &LoopSpec) -> Option<String> {
     })
 }
 
-/// Where what the component imports and what the loop grants do not go together. Points are granted by the ports, alarms and log
-/// lines to everyone; what a loop grants by its own choice are the topics that it listens to.
+/// Where the loop grants what the component does not ask for. Points are granted by the ports, alarms and log lines to everyone;
+/// what a loop grants by its own choice are the topics that it listens to. A component that could listen and is granted no topic
+/// is no mistake: the stock laws join a chain of loops only where they are told to.
 fn grant_warnings(info: &ComponentInfo, spec: &LoopSpec) -> Option<String> {
     let imports_net = info.imports.iter().any(|import| interface(import) == "net");
     let (title, id) = (title(info), &spec.id);
-    match (imports_net, spec.listens.as_slice()) {
-        (true, []) => Some(format!(
-            "{title} imports net, and loop {id} grants it no topic: it can publish messages and will receive none; name its \
-             topics under listens if it needs them"
-        )),
-        (false, [_, ..]) => Some(format!(
+    (!imports_net && !spec.listens.is_empty()).then(|| {
+        format!(
             "loop {id} listens to {}, and {title} does not import net: it will never see these messages",
             spec.listens.join(", ")
-        )),
-        _ => None,
-    }
+        )
+    })
 }
 
 /// What a component's measured steps mean for a loop: words of warning, or a refusal. A loop that ran it before within

@@ -515,56 +515,68 @@ pub enum FieldNews {
     /// A job was taken in, began, or ended; without its result.
     Job(Job),
     /// A point is held at a value.
-    Forced {
-        /// The point.
-        point: String,
-        /// Its host.
-        host: String,
-        /// The value, by whom, why and until when.
-        force: Force,
-    },
+    Forced(PointForced),
     /// A point is held no more.
-    Unforced {
-        /// The point.
-        point: String,
-        /// Its host.
-        host: String,
-        /// By whom, or that its time was over.
-        by: String,
-    },
+    Unforced(PointUnforced),
     /// A point was written by hand.
-    Written {
-        /// The point.
-        point: String,
-        /// Its host.
-        host: String,
-        /// The value.
-        value: Option<f64>,
-        /// By whom.
-        by: String,
-    },
+    Written(PointWritten),
+}
+
+/// A point is held at a value.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct PointForced {
+    /// The point.
+    pub point: String,
+    /// Its host.
+    pub host: String,
+    /// The value, by whom, why and until when.
+    pub force: Force,
+}
+
+/// A point is held no more.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct PointUnforced {
+    /// The point.
+    pub point: String,
+    /// Its host.
+    pub host: String,
+    /// By whom, or that its time was over.
+    pub by: String,
+}
+
+/// A point was written by hand.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct PointWritten {
+    /// The point.
+    pub point: String,
+    /// Its host.
+    pub host: String,
+    /// The value.
+    pub value: Option<f64>,
+    /// By whom.
+    pub by: String,
 }
 
 impl From<FieldEvent> for FieldNews {
     fn from(event: FieldEvent) -> Self {
         match event {
             FieldEvent::Job(view) => Self::Job(view.into()),
-            FieldEvent::Forced { point, host, force } => Self::Forced {
+            FieldEvent::Forced { point, host, force } => Self::Forced(PointForced {
                 point: point.to_string(),
                 host: host.to_string(),
                 force: force.into(),
-            },
-            FieldEvent::Unforced { point, host, by } => Self::Unforced {
+            }),
+            FieldEvent::Unforced { point, host, by } => Self::Unforced(PointUnforced {
                 point: point.to_string(),
                 host: host.to_string(),
                 by,
-            },
-            FieldEvent::Written { point, host, value, by } => Self::Written {
+            }),
+            FieldEvent::Written { point, host, value, by } => Self::Written(PointWritten {
                 point: point.to_string(),
                 host: host.to_string(),
                 value: finite(value),
                 by,
-            },
+            }),
         }
     }
 }
