@@ -128,6 +128,10 @@ pub struct Redundant {
     pub with: String,
     /// The number of the mastership, while this host has it; null while it stands by.
     pub epoch: Option<u32>,
+    /// Its own connection works: it is master, or could take over.
+    pub ready: bool,
+    /// Forces of the device's points that this host knows of; the same on both hosts, a moment after one began or ended.
+    pub forces: u32,
 }
 
 /// A job of a bus's configuration.
@@ -158,7 +162,12 @@ impl From<model::BusView> for Bus {
                 .map(|(name, text)| NamedJob { name, text })
                 .collect(),
             jobs_waiting: view.jobs_waiting,
-            redundant: view.master.map(|(with, epoch)| Redundant { with, epoch }),
+            redundant: view.master.map(|part| Redundant {
+                with: part.with,
+                epoch: part.epoch,
+                ready: part.ready,
+                forces: part.forces,
+            }),
         }
     }
 }
@@ -520,6 +529,8 @@ pub enum FieldNews {
     Unforced(PointUnforced),
     /// A point was written by hand.
     Written(PointWritten),
+    /// A host that stands by for another's device can take it over no more, or can again.
+    Standby(StandbyTold),
 }
 
 /// A point is held at a value.
@@ -557,6 +568,21 @@ pub struct PointWritten {
     pub by: String,
 }
 
+/// A host that stands by for another's device can take it over no more, or can again.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct StandbyTold {
+    /// The bus.
+    pub bus: String,
+    /// The host that stands by.
+    pub host: String,
+    /// The one that it stands by for.
+    pub with: String,
+    /// It could take over.
+    pub ready: bool,
+    /// Why not; empty where it could.
+    pub reason: String,
+}
+
 impl From<FieldEvent> for FieldNews {
     fn from(event: FieldEvent) -> Self {
         match event {
@@ -576,6 +602,19 @@ impl From<FieldEvent> for FieldNews {
                 host: host.to_string(),
                 value: finite(value),
                 by,
+            }),
+            FieldEvent::Standby {
+                bus,
+                host,
+                with,
+                ready,
+                reason,
+            } => Self::Standby(StandbyTold {
+                bus,
+                host: host.to_string(),
+                with: with.to_string(),
+                ready,
+                reason,
             }),
         }
     }
