@@ -122,7 +122,7 @@ async fn answer(field: &dyn Field, payload: &[u8]) -> Word {
     let end = match question {
         Question::Start(request) => match (*request).try_into() {
             Ok(draft) => field.start_job(draft).await.map_err(Problem::from),
-            Err(problem) => Err(problem),
+            Err(error) => Err(Problem::from(error)),
         },
         Question::Show(id) => field.job(id).await.map_err(Problem::from),
         Question::Cancel { id, by } => field.cancel_job(id, by).await.map_err(Problem::from),

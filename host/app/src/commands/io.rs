@@ -204,6 +204,7 @@ fn buses(client: &Client, json: bool) -> Result<(), Error> {
                         with,
                         epoch: None,
                         ready,
+                        ..
                     }),
                 ) if *ready => format!("stands by for {with}"),
                 (true, Some(Redundant { with, epoch: None, .. })) => format!("cannot stand by for {with}"),

@@ -242,7 +242,7 @@ fn spoiled(relay: &Relay) -> Verdict {
 fn stranger(port: u16) -> Verdict {
     let away =
         "[[bus.point]]\nid = \"away\"\ntable = \"holding\"\naddress = 0\nunit_id = 9\nlow = 0.0\nhigh = 65535.0\n";
-    let ours = Ours::open(port, &format!("connections = 2\n{away}"));
+    let ours = Ours::open(port, away);
     let came = ours.until("h0", || ours.value("h0").is_ok());
     if came != Verdict::Good {
         return came;

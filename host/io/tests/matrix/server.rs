@@ -316,8 +316,8 @@ fn over() -> Vec<(Value, Vec<u8>)> {
     };
     let words: Vec<u16> = vec![1; 124];
     let bits: Vec<u16> = vec![1; 1969];
-    // The count of bytes of 124 registers is 248; of 1,969 coils 247.
-    let sixteen = [vec![16, 0, 0, 0, 124, 248], vec![0; 248]].concat();
+    // The bytes of 124 registers do not fit in a request, so they say that they are 248, and fewer come; those of 1,969 coils fit.
+    let sixteen = [vec![16, 0, 0, 0, 124, 248], vec![0; 246]].concat();
     let fifteen = [vec![15, 0, 0, 0x07, 0xB1, 247], vec![0; 247]].concat();
     let both = [vec![23, 0, 0, 0, 126, 0, 0, 0, 1, 2], vec![0; 2]].concat();
     vec![
