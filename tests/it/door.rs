@@ -136,7 +136,7 @@ fn a_program_on_the_bus_gets_both_replies() {
             json!({"start": {"bus": "line", "name": "nothing", "by": "scada"}}),
             "no job",
         ),
-        (PLANT, json!({"start": {"bus": "line", "by": "scada"}}), "name"),
+        (PLANT, json!({"start": {"bus": "line", "by": "scada"}}), "does nothing"),
         (PLANT, json!({"begin": 1}), "cannot be read"),
         (PLANT, json!({"show": "plant.1"}), "knows no job"),
     ] {

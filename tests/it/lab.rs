@@ -411,7 +411,7 @@ fn a_plant_is_uploaded_and_run_by_a_host_that_never_saw_its_file() {
         "{said}"
     );
     {
-        let host = HostProcess::start(options("[roles]\nio = true\ncontrol = false\n"), folder.path()).unwrap();
+        let host = HostProcess::start(options("[roles]\nio = false\ncontrol = true\n"), folder.path()).unwrap();
         host.api()
             .wait_until("the copy of the library", |api| {
                 let all = api.components().unwrap();

@@ -229,6 +229,10 @@ const TLS: &str = "[tls]\ncertificate = \"a\"\nkey = \"b\"\nclient_ca = \"c\"\n"
 
 #[test]
 fn roles_say_who_asks_and_who_writes() {
+    let registers = |start: u16, words: &[u16]| Write::Registers {
+        start,
+        words: words.to_vec(),
+    };
     let text = format!(
         "read_roles = [\"viewer\", \"operator\", \"engineer\"]\nwrite_roles = [\"operator\", \"engineer\"]\n{TLS}{}{}{}",
         entry("holding", 0, "point = \"a\"\nwritable = true"),
