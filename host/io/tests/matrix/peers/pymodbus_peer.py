@@ -17,7 +17,6 @@ import ssl
 import sys
 
 from pymodbus.client import ModbusTcpClient, ModbusTlsClient
-from pymodbus.exceptions import ModbusException
 
 TABLES = {"coil": "coils", "discrete": "discrete_inputs", "holding": "holding_registers", "input": "input_registers"}
 
@@ -72,8 +71,8 @@ def client(port, unit, folder=None, name=None):
     for line in sys.stdin:
         try:
             answer = ask(json.loads(line))
-        except (ModbusException, ValueError) as error:
-            answer = {"error": str(error)}
+        except Exception as error:  # whatever it finds wrong with a request is its own way of saying no
+            answer = {"error": str(error) or type(error).__name__}
         print(json.dumps(answer), flush=True)
 
 
