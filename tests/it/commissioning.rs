@@ -2,7 +2,7 @@
 
 use std::{process::Output, time::Duration};
 
-use bumpless_tests::{Api, Binary, Cell, CellOptions, FieldDevice, PLANT, pressure_loop, wait_until};
+use bumpless_tests::{Api, Binary, Cell, CellOptions, Event, FieldDevice, PLANT, pressure_loop, wait_until};
 use serde_json::{Value, json};
 
 use crate::{number, text};
@@ -53,7 +53,7 @@ writable = true
     )
 }
 
-fn device_cell(device: &FieldDevice) -> Cell {
+pub(crate) fn device_cell(device: &FieldDevice) -> Cell {
     let mut cell = Cell::start(CellOptions {
         controllers: 1,
         bus: device_bus(device),
@@ -207,7 +207,22 @@ fn a_forced_input_is_what_the_loop_sees_and_ends_by_itself() {
     api.apply(&draft).unwrap();
     let feed = api.live("").unwrap();
     let force = json!({"value": 1.75, "seconds": 2, "by": "test", "why": "a broken wire"});
+    let news = api.live("").unwrap();
     api.post(&format!("/v1/points/{input}/force"), &force).unwrap();
+    let told = |kind: &str| {
+        let is = |event: &Event| event.name == "field" && event.data[kind]["point"] == input.as_str();
+        news.event_where(kind, is).unwrap().data[kind].clone()
+    };
+    let forced = told("forced");
+    assert_eq!(
+        (
+            number(&forced["force"]["value"]),
+            &forced["force"]["why"],
+            &forced["host"]
+        ),
+        (1.75, &json!("a broken wire"), &json!(PLANT)),
+        "{forced}"
+    );
     feed.record_where("the forced measurement", |record| {
         let readings = record["readings"].as_array().unwrap();
         let pv = readings.iter().find(|reading| reading["port"] == "pv").unwrap();
@@ -219,6 +234,7 @@ fn a_forced_input_is_what_the_loop_sees_and_ends_by_itself() {
         events.iter().any(|event| event["kind"] == "unforced")
     })
     .unwrap();
+    assert_eq!(told("unforced")["by"], "its time was over");
     let bad = json!({"value": 1.75, "seconds": 90_000, "by": "test", "why": "too long"});
     let (code, problem) = status(&api, "POST", &format!("/v1/points/{input}/force"), &bad);
     assert_eq!(code, 422, "{problem}");
@@ -255,8 +271,8 @@ fn jobs_are_acknowledged_at_once_however_slow_the_device_is() {
         "{failed}"
     );
 
-    // Two seconds for every answer: the acknowledgement and all that is answered from memory come at once.
-    device.set_delay(Duration::from_secs(2));
+    // Four seconds for every answer: the acknowledgement and all that is answered from memory come before the device's.
+    device.set_delay(Duration::from_secs(4));
     let read = json!({"bus": "line", "by": "test", "read_block": {"table": "holding", "address": 100, "count": 2}});
     let slow = api.post("/v1/jobs", &read).unwrap();
     assert!(matches!(text(&slow["state"]).as_str(), "queued" | "running"), "{slow}");
@@ -267,6 +283,12 @@ fn jobs_are_acknowledged_at_once_however_slow_the_device_is() {
         "the key names the same job"
     );
     assert_eq!(api.get("/v1/points/line.valve").unwrap()["name"], "line.valve");
+    assert!(api.get("/v1/buses").unwrap()["buses"].is_array());
+    let pending = api.get(&format!("/v1/jobs/{}", text(&slow["id"]))).unwrap();
+    assert!(
+        matches!(text(&pending["state"]).as_str(), "queued" | "running"),
+        "what is answered from memory came first: {pending}"
+    );
     let waiting: Vec<Value> = (0..16).map_while(|_| api.post("/v1/jobs", &read).ok()).collect();
     let (code, problem) = status(&api, "POST", "/v1/jobs", &read);
     assert_eq!(code, 503, "the queue is full: {problem}");

@@ -106,24 +106,41 @@ fn documents() -> Vec<PathBuf> {
     files
 }
 
+/// The guides that are run, and the fewest blocks of each: a mark that is lost is a guide that nobody tries any more.
+const MARKED: [(&str, usize); 7] = [
+    ("api.md", 8),
+    ("change-safely.md", 10),
+    ("commissioning.md", 5),
+    ("first-loop.md", 8),
+    ("lab.md", 3),
+    ("modbus.md", 6),
+    ("redundancy.md", 3),
+];
+
 #[test]
 fn the_commands_in_the_guides_run() {
     let mut failures = Vec::new();
-    let mut count = 0;
+    let mut marked = std::collections::BTreeMap::new();
     for path in documents() {
         let text = fs::read_to_string(&path).unwrap();
         let blocks = blocks(&text);
         if blocks.is_empty() {
             continue;
         }
-        count += blocks.len();
         let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        marked.insert(name.clone(), blocks.len());
         if let Err(why) = run(&name, &blocks) {
             failures.push(format!("{name}: {why}"));
         }
     }
     assert!(failures.is_empty(), "{}", failures.join("\n\n"));
-    assert!(count >= 5, "only {count} blocks are marked <!-- run -->");
+    for (name, least) in MARKED {
+        let found = marked.get(name).copied().unwrap_or(0);
+        assert!(
+            found >= least,
+            "{name}: {found} blocks are marked <!-- run -->; there were {least}"
+        );
+    }
 }
 
 #[test]

@@ -3,7 +3,7 @@
 use std::{fs, path::Path};
 
 use bumpless_core::indices::{Indices, Rule, StepResponse, TotalVariation};
-use bumpless_tests::{Api, Binary, Cell, CellOptions, components, first_order_loop};
+use bumpless_tests::{Api, Binary, Cell, CellOptions, HostOptions, HostProcess, components, first_order_loop};
 use serde_json::{Value, json};
 
 use crate::{number, text};
@@ -365,4 +365,76 @@ fn a_plant_that_is_a_component_is_a_bus_of_a_live_host() {
     .unwrap();
     let bus = cell.plant.api().point("tanks.v2").unwrap();
     assert!(number(&bus["value"]) > 3.0, "{bus}");
+}
+
+#[test]
+fn a_plant_is_uploaded_and_run_by_a_host_that_never_saw_its_file() {
+    const BUS: &str = "[roles]\nio = true\ncontrol = false\n[[bus]]\nid = \"tank\"\ndriver = \"sim\"\n\
+                       plant = \"library:integrating\"\nconstants = { start = 5.0 }\n";
+    let mut cell = Cell::start(CellOptions::default().controllers(1)).unwrap();
+    let api = cell.api_of("a").unwrap();
+    let file = components().unwrap().join("plants/integrating.wasm");
+    let info = api.upload(&file).unwrap();
+    assert_eq!(
+        (&info["name"], &info["world"], &info["admission"]["verdict"]),
+        (
+            &json!("integrating"),
+            &json!("bumpless:control/plant@0.1.0"),
+            &json!("passed")
+        ),
+        "{info}"
+    );
+    // A loop says that it cannot run it.
+    let refused = api.apply(&json!({
+        "name": "x", "component": "integrating", "period_ms": 100.0, "setpoint": 1.0,
+        "ports": {"pv": "plant.pit129", "out": "plant.p1"},
+    }));
+    let said = refused.expect_err("a plant is no law").to_string();
+    assert!(said.contains("is a plant, and no controller"), "{said}");
+
+    let folder = tempfile::tempdir().unwrap();
+    let other = cell.host("a").unwrap();
+    let (name, connect) = (other.cell_name().to_owned(), other.cell.clone());
+    let options = |tables: &str| HostOptions {
+        name: "tanks".to_owned(),
+        cell: name.clone(),
+        connect: connect.clone(),
+        tables: tables.to_owned(),
+        ..HostOptions::default()
+    };
+    // The library is not on this disk yet, and the host says what to do.
+    let said = HostProcess::start(options(BUS), folder.path())
+        .expect_err("nothing is on its disk")
+        .to_string();
+    assert!(
+        said.contains("upload it at any host of the cell while this one runs"),
+        "{said}"
+    );
+    {
+        let host = HostProcess::start(options("[roles]\nio = false\ncontrol = true\n"), folder.path()).unwrap();
+        host.api()
+            .wait_until("the copy of the library", |api| {
+                let all = api.components().unwrap();
+                if all.iter().any(|one| one["name"] == "integrating") {
+                    Ok(())
+                } else {
+                    Err(all)
+                }
+            })
+            .unwrap();
+    }
+    let host = HostProcess::start(options(BUS), folder.path()).unwrap();
+    let own = host.api();
+    assert!((number(&own.point("tank.pv").unwrap()["value"]) - 5.0).abs() < 0.5);
+    own.post("/v1/points/tank.out/write", &json!({"value": 10.0, "by": "test"}))
+        .unwrap();
+    own.wait_until("the level rises", |api| {
+        let level = api.point("tank.pv").unwrap();
+        if number(&level["value"]) > 6.0 {
+            Ok(())
+        } else {
+            Err(level)
+        }
+    })
+    .unwrap();
 }

@@ -7,6 +7,7 @@
 //! | changes | what may change while a loop runs, what brings it back, and owners that die meanwhile |
 //! | phases | the owner dies in each phase of an upload, a backtest, a change, a rollout |
 //! | commissioning | points by hand, forces, jobs, point lists |
+//! | door | jobs over the bus, by a program that is no host |
 //! | masters | two hosts for one device |
 //! | members | frozen owners, late hosts, hosts that leave |
 //! | drain | hosts that are emptied, restarted one by one, preferred, cut off |
@@ -14,6 +15,7 @@
 //! | history | replays, backtests, shadows |
 //! | rollouts | one component for many loops, one loop first |
 //! | calls | the cell as a control service |
+//! | recovery | a measurement that comes back, under each policy on bad input |
 //! | refusals | bad components, loops, requests, configurations, command lines |
 //! | votes | a host whose steps come out wrong, and who notices |
 //! | modbus | a real Modbus device that dies and comes back |
@@ -40,6 +42,7 @@ mod calls;
 mod changes;
 mod chaos;
 mod commissioning;
+mod door;
 mod drain;
 mod guides;
 mod history;
@@ -51,6 +54,7 @@ mod members;
 mod modbus;
 mod neighbours;
 mod phases;
+mod recovery;
 mod refusals;
 mod restarts;
 mod rollouts;

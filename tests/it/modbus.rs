@@ -17,15 +17,20 @@ const LOOP: &str = "temperature";
 /// What the heater's register counts, per %.
 const COUNTS: f64 = 100.0;
 
-/// Python with the example's packages, in a folder of its own under the target folder; made once.
+/// Python with the example's packages.
 fn python() -> PathBuf {
+    python_with("modbus-python", &example("requirements.txt"))
+}
+
+/// Python with some packages, in a folder of its own under the target folder; made once.
+pub(crate) fn python_with(name: &str, requirements: &Path) -> PathBuf {
     let components = bumpless_tests::components().unwrap();
-    let folder = components.parent().unwrap().join("modbus-python");
+    let folder = components.parent().unwrap().join(name);
     fs::create_dir_all(&folder).unwrap();
     // Two test processes must not build one environment.
     let lock = File::create(folder.join(".lock")).unwrap();
     lock.lock().unwrap();
-    let wanted = fs::read_to_string(example("requirements.txt")).unwrap();
+    let wanted = fs::read_to_string(requirements).unwrap();
     let python = folder.join("bin/python");
     let stamp = folder.join("installed.txt");
     if fs::read_to_string(&stamp).is_ok_and(|installed| installed == wanted) {
@@ -47,7 +52,7 @@ fn python() -> PathBuf {
         Command::new("python3").args(["-m", "venv"]).arg(&folder),
     );
     step(
-        "pip install pymodbus",
+        "pip install",
         Command::new(&python)
             .args([
                 "-m",
@@ -57,7 +62,7 @@ fn python() -> PathBuf {
                 "--disable-pip-version-check",
                 "--requirement",
             ])
-            .arg(example("requirements.txt")),
+            .arg(requirements),
     );
     fs::write(&stamp, wanted).unwrap();
     python

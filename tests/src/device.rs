@@ -50,6 +50,8 @@ struct Inside {
     watched: usize,
     /// The device answers so much later.
     delay: Duration,
+    /// A port that answers nothing any more, as if its cable were out.
+    cut: Option<usize>,
     random: u32,
 }
 
@@ -74,6 +76,7 @@ impl FieldDevice {
             obeyed: Vec::new(),
             watched: usize::from(watched).min(ADDRESSES - 3),
             delay: Duration::ZERO,
+            cut: None,
             random: 0x2545_f491,
         }));
         let ending = Arc::new(AtomicBool::new(false));
@@ -115,6 +118,11 @@ impl FieldDevice {
     /// Answers so much later from now on.
     pub fn set_delay(&self, delay: Duration) {
         held(&self.inside).delay = delay;
+    }
+
+    /// Cuts one master's way to the device, or none's.
+    pub fn cut(&self, master: Option<usize>) {
+        held(&self.inside).cut = master;
     }
 
     /// A register as it is now; 0 where there is none.
@@ -176,7 +184,13 @@ fn serve(mut stream: TcpStream, master: usize, inside: &Mutex<Inside>, ending: &
             Err(_) => return,
         }
         while let Some(frame) = frame(&mut buffer) {
-            let delay = held(inside).delay;
+            let (delay, cut) = {
+                let inside = held(inside);
+                (inside.delay, inside.cut)
+            };
+            if cut == Some(master) {
+                continue;
+            }
             // The device is busy: that is what is played here.
             std::thread::sleep(delay);
             let (Some(head), Some(&unit), Some(pdu)) = (frame.get(..4), frame.get(6), frame.get(7..)) else {

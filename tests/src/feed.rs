@@ -99,6 +99,26 @@ impl Feed {
         })
     }
 
+    /// The next event that is as wanted; those before it are passed over. Waits 30 s at most.
+    ///
+    /// # Errors
+    /// As [`Feed::next`].
+    pub fn event_where(&self, what: &str, is: impl Fn(&Event) -> bool) -> Result<Event, Error> {
+        let start = Instant::now();
+        loop {
+            let left = WAIT_MAX.saturating_sub(start.elapsed());
+            let next = self
+                .next(left)
+                .map_err(|error| Error::FeedEnded(format!("{error}; waited for {what}")))?;
+            if is(&next) {
+                return Ok(next);
+            }
+            if left.is_zero() {
+                return Err(Error::FeedEnded(format!("it never came: {what}")));
+            }
+        }
+    }
+
     /// The next record.
     ///
     /// # Errors

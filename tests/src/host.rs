@@ -98,6 +98,12 @@ impl HostProcess {
         Ok(host)
     }
 
+    /// The name of its cell.
+    #[must_use]
+    pub fn cell_name(&self) -> &str {
+        &self.options.cell
+    }
+
     /// Starts a host without waiting; [`HostProcess::wait_ready`] must follow.
     ///
     /// # Errors

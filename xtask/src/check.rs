@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use crate::{
     Error, components, deny, page,
-    run::{cargo, output, program, run, say},
+    run::{cargo, output, program, run, say, target_folder},
 };
 
 /// A step: name, whether the quick run has it, and what it does.
@@ -104,5 +104,12 @@ fn tests(fast: bool) -> Result<(), Error> {
     if fast {
         return run(&mut cargo("test --workspace --lib --bins --quiet"));
     }
-    run(&mut cargo("test --workspace --no-fail-fast"))
+    let done = run(&mut cargo("test --workspace --no-fail-fast"));
+    // A good test shows nothing; this one's table is for people.
+    let matrix = target_folder().join("tmp/modbus-matrix.txt");
+    match std::fs::read_to_string(&matrix) {
+        Ok(table) => say(&format!("\n{table}")),
+        Err(error) => say(&format!("no table of Modbus peers at {} ({error})", matrix.display())),
+    }
+    done
 }

@@ -18,6 +18,7 @@ pub mod limits;
 pub mod types;
 
 mod cell;
+mod door;
 mod error;
 mod extract;
 mod field;

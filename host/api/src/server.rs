@@ -30,6 +30,7 @@ use tracing::Instrument as _;
 
 use crate::{
     cell::{Answer, Cell},
+    door,
     error::{Error, Kind, Problem},
     gate::Gate,
     limits::{
@@ -161,6 +162,7 @@ pub async fn serve(
     options: Options,
     shutdown: impl Future<Output = ()> + Send + 'static,
 ) -> Result<(), Error> {
+    door::open(&deploy);
     serve_cell(listener, Arc::new(deploy), &options, shutdown).await
 }
 

@@ -14,6 +14,7 @@ mod hosts;
 mod library;
 mod live;
 mod loops;
+mod news;
 mod record;
 mod rollouts;
 mod words;
@@ -26,8 +27,8 @@ pub use alarms::{
 pub use call::{CallAnswer, CallRequest};
 pub use component::{Component, Components, Parameter, Port};
 pub use field::{
-    Block, Bus, Buses, ByRequest, FieldNews, Force, ForceRequest, Job, JobRequest, JobState, Jobs, NamedJob,
-    PointForced, PointUnforced, PointWritten, ReadBlock, Redundant, ScanRequest, Table, WriteBlock, WriteRequest,
+    Block, Bus, Buses, ByRequest, Force, ForceRequest, Job, JobRequest, JobState, Jobs, NamedJob, ReadBlock, Redundant,
+    ScanRequest, Table, WriteBlock, WriteRequest,
 };
 pub use history::{
     BacktestRequest, CurvePoint, CycleFinding, Cycles, LoopIndices, OutputTrial, Replay, ReplayRequest, Shadow,
@@ -40,6 +41,7 @@ pub use loops::{
     Apply, Command, Failure, HandOver, Loop, LoopDraft, Loops, ModeRequest, MoveRequest, OutputLimit, OutputRequest,
     Policy, RollbackRequest, SetRequest, SetpointRequest, SwapRequest, Tally,
 };
+pub use news::{FieldNews, PointForced, PointUnforced, PointWritten, StandbyTold};
 pub use record::{Alarm, Applied, Aside, Event, LogLine, Message, Reading, Record, Redundancy, Vote};
 pub use rollouts::{OnFailure, Rollout, RolloutLoop, RolloutRequest, RolloutStage, RolloutState, Rollouts, SilentHost};
 pub use words::{Direction, LogLevel, Mode, OnBump, OnFault, OnFewer, PortKind, Priority, Quality, Strategy};

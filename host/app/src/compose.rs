@@ -128,7 +128,10 @@ pub async fn run(config: Config, faults: Option<mpsc::Sender<Fault>>) -> Result<
     let io = if config.io {
         let runtime = tokio::runtime::Handle::current();
         // Plants that are components: the I/O knows no sandbox, the lab's library joins the two.
-        let plants = Library::new(engine.clone(), bumpless_lab::folders(None));
+        let uploaded = store.clone();
+        let plants = Library::new(engine.clone(), bumpless_lab::folders(None)).with_uploaded(move |reference| {
+            bumpless_deploy::plant_bytes(&uploaded, reference).map_err(|error| error.to_string())
+        });
         let buses = config.buses.clone();
         let server = blocking(move || IoServer::open_with(&buses, clock, &runtime, &plants))
             .await?

@@ -40,7 +40,7 @@ pub(crate) struct Inbox {
     /// Set once this host's own token is out: from then on an older namesake is a conflict.
     pub(crate) joined: AtomicBool,
     sink: Sink,
-    runtime: Handle,
+    pub(crate) runtime: Handle,
     in_flight: Arc<AtomicUsize>,
     members: RwLock<Members>,
     /// Held while a change of members is told, so that comings and goings are told in their order. The sink may read

@@ -9,6 +9,7 @@
 //! bumpless/<cell>/vitals/<host>               how a host is
 //! bumpless/<cell>/notice/<host>               something changed at a host
 //! bumpless/<cell>/alive/<host>/<instance>     liveliness token of one life of a host
+//! bumpless/<cell>/open/<door>/<host>          what programs that are no hosts may ask (see `door`)
 //! ```
 //!
 //! The cell is in every key, so cells that share a network do not hear each other. The sender is in the key, so it needs
@@ -145,6 +146,11 @@ impl Keys {
             Key::Notice(host) => format!("{PREFIX}/{cell}/notice/{host}"),
             Key::Alive(host, instance) => format!("{PREFIX}/{cell}/alive/{host}/{}", instance.0),
         }
+    }
+
+    /// A door of a host.
+    pub(crate) fn door(&self, door: &str, host: &HostId) -> String {
+        format!("{PREFIX}/{}/open/{door}/{host}", self.cell)
     }
 
     /// Takes a text apart.

@@ -72,3 +72,9 @@ const _: () = assert!(
     CYCLE_BATCHES * 65_535 > 2 * CYCLE_BYTES_MAX,
     "two largest cycle messages must fit in one lane"
 );
+
+/// Bytes of one question at a door: a block of 20,000 values in JSON fits.
+pub const DOOR_BYTES_MAX: usize = 256 * 1024;
+
+/// Questions at one door that are answered at a time; a further one is turned away.
+pub const DOOR_ASKED_MAX: usize = 64;

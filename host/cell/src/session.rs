@@ -49,7 +49,7 @@ const NAME_LOOK_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// What the clones of a session share.
 pub(crate) struct Shared {
-    inbox: Arc<Inbox>,
+    pub(crate) inbox: Arc<Inbox>,
     lanes: Lanes,
     token: Mutex<Option<LivelinessToken>>,
     locators: Vec<String>,
@@ -60,7 +60,7 @@ pub(crate) struct Shared {
 /// A host's place on the bus. Clones are the same place.
 #[derive(Clone)]
 pub struct Session {
-    shared: Arc<Shared>,
+    pub(crate) shared: Arc<Shared>,
 }
 
 impl std::fmt::Debug for Session {

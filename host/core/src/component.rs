@@ -27,8 +27,11 @@ pub const LABEL_CHARS_MAX: usize = 64;
 /// Changes of a component's summary that are remembered, the newest last.
 pub const HISTORY_MAX: usize = 16;
 
-/// The world of a controller: what a component must be to be taken in today.
+/// The world of a controller: what a loop runs.
 pub const CONTROLLER_WORLD: &str = "bumpless:control/controller@0.1.0";
+
+/// The world of a plant: what a simulated bus and an experiment run.
+pub const PLANT_WORLD: &str = "bumpless:control/plant@0.1.0";
 
 /// One thing that happened to a component in the library.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -168,7 +171,11 @@ impl ComponentInfo {
     /// # Errors
     /// The first thing that does not hold.
     pub fn check(&self) -> Result<(), ComponentInfoError> {
-        self.descriptor.check()?;
+        if self.is_plant() {
+            self.descriptor.check_plant()?;
+        } else {
+            self.descriptor.check()?;
+        }
         if self.name != self.descriptor.name || self.version != self.descriptor.version {
             let cut = |name: &str, version: &str| format!("{name} {version}").chars().take(TEXT_CHARS_MAX).collect();
             return Err(ComponentInfoError::Differs {
@@ -206,6 +213,12 @@ impl ComponentInfo {
             admission.check()?;
         }
         Ok(())
+    }
+
+    /// Is it a plant, and no controller?
+    #[must_use]
+    pub fn is_plant(&self) -> bool {
+        self.world == PLANT_WORLD
     }
 
     /// How new this copy is.

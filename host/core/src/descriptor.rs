@@ -173,10 +173,14 @@ fn short_name(what: &'static str, name: &str) -> Result<(), DescriptorError> {
     }
 }
 
-fn unique<'a>(what: &'static str, names: impl Iterator<Item = &'a str>) -> Result<(), DescriptorError> {
+fn unique<'a>(what: &'static str, names: impl Iterator<Item = &'a str>, dots: bool) -> Result<(), DescriptorError> {
     let mut seen = std::collections::HashSet::new();
     for name in names {
-        short_name(what, name)?;
+        if dots {
+            short_name(what, &name.replace('.', "-"))?;
+        } else {
+            short_name(what, name)?;
+        }
         if !seen.insert(name) {
             return Err(DescriptorError::Twice {
                 what,
@@ -190,6 +194,23 @@ fn unique<'a>(what: &'static str, names: impl Iterator<Item = &'a str>) -> Resul
 impl Descriptor {
     /// Checks everything that a guest may have got wrong or lied about: names, numbers, ranges, lengths.
     pub fn check(&self) -> Result<(), DescriptorError> {
+        self.check_parts(false)?;
+        if self.outputs().next().is_none() {
+            return Err(DescriptorError::NoOutput);
+        }
+        Ok(())
+    }
+
+    /// As [`Descriptor::check`], for a plant: its ports are its signals, seen from a controller. Their names may have dots,
+    /// and none of them need be one that a controller sets.
+    ///
+    /// # Errors
+    /// As [`Descriptor::check`].
+    pub fn check_plant(&self) -> Result<(), DescriptorError> {
+        self.check_parts(true)
+    }
+
+    fn check_parts(&self, dots: bool) -> Result<(), DescriptorError> {
         short_name("component name", &self.name)?;
         let version_parts: Vec<&str> = self.version.split('.').collect();
         let number = |p: &&str| (1..=6).contains(&p.len()) && p.bytes().all(|b| b.is_ascii_digit());
@@ -205,8 +226,8 @@ impl Descriptor {
         };
         too_many("port", self.ports.len(), PORTS_MAX)?;
         too_many("parameter", self.parameters.len(), PARAMETERS_MAX)?;
-        unique("port", self.ports.iter().map(|p| p.name.as_str()))?;
-        unique("parameter", self.parameters.iter().map(|p| p.name.as_str()))?;
+        unique("port", self.ports.iter().map(|p| p.name.as_str()), dots)?;
+        unique("parameter", self.parameters.iter().map(|p| p.name.as_str()), false)?;
         let texts = std::iter::once((&self.name, &self.text))
             .chain(self.ports.iter().flat_map(|p| [(&p.name, &p.text), (&p.name, &p.unit)]))
             .chain(
@@ -223,9 +244,6 @@ impl Descriptor {
             if text.chars().count() > TEXT_CHARS_MAX {
                 return Err(DescriptorError::TextTooLong(owner.clone()));
             }
-        }
-        if self.outputs().next().is_none() {
-            return Err(DescriptorError::NoOutput);
         }
         for p in &self.parameters {
             too_many("choice", p.choices.len(), PARAMETERS_MAX)?;

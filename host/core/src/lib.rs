@@ -45,7 +45,7 @@ pub use digest::Digest;
 pub use frame::{AlarmChange, Cycle, Effects, Fault, Frame, LogLevel, LogLine, Message, Priority};
 pub use intent::{Intent, IntentError};
 pub use name::{BusId, CellName, HostId, LoopId, NameError, PointId};
-pub use reading::{NoData, Quality, Reading};
+pub use reading::{NoData, Quality, Reading, device_error_name};
 pub use record::{Applied, Command, CommandBody, CommandId, Event, Outcome, Record};
 pub use redundancy::Redundancy;
 pub use spec::{LoopSpec, Mode, OnBump, OnFault, OnFewer, OutputLimit, Policy, SpecError, Strategy};

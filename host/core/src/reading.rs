@@ -1,5 +1,7 @@
 //! A value is never bare: it comes with a reason where it is missing, a quality, and the time when it was true.
 
+use std::fmt;
+
 use serde::{Deserialize, Serialize};
 
 /// How far a value may be trusted.
@@ -32,6 +34,43 @@ pub enum NoData {
     NotFinite,
     /// The port is not connected to a point.
     NotConnected,
+}
+
+/// What a device means by an error code. Source: Modbus application protocol V1.1b3, section 7; devices send others too.
+#[must_use]
+pub const fn device_error_name(code: u8) -> &'static str {
+    match code {
+        1 => "illegal function",
+        2 => "illegal data address",
+        3 => "illegal data value",
+        4 => "server device failure",
+        5 => "acknowledge, still working",
+        6 => "server device busy",
+        7 => "negative acknowledge",
+        8 => "memory parity error",
+        10 => "gateway path unavailable",
+        11 => "gateway target device failed to respond",
+        _ => "unknown to the standard",
+    }
+}
+
+impl fmt::Display for NoData {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::NeverRead => f.write_str("not read since the host started"),
+            Self::CommsLost => f.write_str("the device does not answer"),
+            Self::DeviceError(code) => {
+                write!(
+                    f,
+                    "the device answered with exception {code}, {}",
+                    device_error_name(*code)
+                )
+            }
+            Self::OutOfRange => f.write_str("the raw value is outside what the instrument can send"),
+            Self::NotFinite => f.write_str("the value is not a finite number"),
+            Self::NotConnected => f.write_str("not connected"),
+        }
+    }
 }
 
 /// One reading of a point, as a frame freezes it.
@@ -84,5 +123,33 @@ impl Reading {
     #[must_use]
     pub fn value_or_last(&self) -> f64 {
         self.value.unwrap_or(self.last_good)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_reason_has_its_words() {
+        for (reason, words) in [
+            (NoData::NeverRead, "not read since the host started"),
+            (NoData::CommsLost, "the device does not answer"),
+            (
+                NoData::DeviceError(2),
+                "the device answered with exception 2, illegal data address",
+            ),
+            (
+                NoData::DeviceError(11),
+                "the device answered with exception 11, gateway target device failed to respond",
+            ),
+            (
+                NoData::DeviceError(200),
+                "the device answered with exception 200, unknown to the standard",
+            ),
+            (NoData::NotConnected, "not connected"),
+        ] {
+            assert_eq!(reason.to_string(), words);
+        }
     }
 }

@@ -9,14 +9,17 @@
 //! ```
 
 mod frames;
+mod plant;
 mod trial;
+
+pub(crate) use plant::plant_descriptor;
 
 use std::{sync::Arc, time::Duration};
 
 use bumpless_core::{
     Admission, ComponentInfo, Finding, Fit, HostId, LoopSpec, Severity, Verdict, admission::FINDINGS_MAX,
 };
-use bumpless_engine::{INTERFACES, Prepared};
+use bumpless_engine::{INTERFACES, Prepared, PreparedPlant};
 use tokio::{sync::oneshot, time::timeout};
 
 use crate::{
@@ -50,6 +53,35 @@ impl Room {
             &trial,
             self.here.clone(),
             imports,
+            compile_time,
+            self.clock.unix_ms(),
+        ))
+    }
+}
+
+impl Room {
+    /// As [`Room::tried`], for a plant.
+    pub(crate) async fn tried_plant(
+        &self,
+        prepared: Arc<PreparedPlant>,
+        compile_time: Option<Duration>,
+    ) -> Result<Admission, Error> {
+        let crowded = |_| {
+            Error::busy(
+                format!("other components are being tried at host {}", self.here),
+                "try again",
+            )
+        };
+        let _turn = timeout(TRIAL_WAIT, self.trials.acquire())
+            .await
+            .map_err(crowded)?
+            .map_err(|_| stopping())?;
+        let imports = prepared.imports().to_vec();
+        let trial = on_own_thread(move || plant::run(&prepared)).await?;
+        Ok(report(
+            &trial,
+            self.here.clone(),
+            &imports,
             compile_time,
             self.clock.unix_ms(),
         ))

@@ -207,8 +207,10 @@ impl Room {
     /// How far this host is with a component.
     pub(crate) fn stage_here(&self, digest: &Digest) -> Stage {
         self.bench.stage(digest).unwrap_or_else(|| {
+            // A plant is compiled by the bus that runs it.
+            let is_plant = || self.library.get(digest).is_some_and(|info| info.is_plant());
             if self.store.has_component(digest) {
-                Stage::Bytes
+                if is_plant() { Stage::Ready } else { Stage::Bytes }
             } else {
                 Stage::Nothing
             }
@@ -260,6 +262,8 @@ impl Room {
         loop {
             tick.tick().await;
             let mut infos = room.library.all();
+            // Plants are run by buses, each on its own host, from its start.
+            infos.retain(|info| !info.is_plant());
             infos.sort_by_key(|info| std::cmp::Reverse(info.uploaded_at_unix_ms));
             room.forget_unneeded(&infos);
             let now = Instant::now();

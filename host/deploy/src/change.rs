@@ -30,6 +30,7 @@ use crate::{
     error::{Error, chain},
     expect::Expect,
     holder::wanted_members,
+    library::as_controller,
     limits::{CHANGE_WAIT, COMMAND_WAIT_MIN, LOOPS_MAX, READY_WAIT},
     plan::{self, Ground},
     room::{Room, count},
@@ -187,8 +188,8 @@ impl Room {
     /// A component by reference; by digest also where only the asker has heard of it yet.
     async fn component(self: &Arc<Self>, reference: &str, from: &HostId) -> Result<Arc<ComponentInfo>, Error> {
         match reference.parse() {
-            Ok(digest) => self.info_of(digest, Some(from)).await,
-            Err(_) => self.library.resolve(reference),
+            Ok(digest) => as_controller(self.info_of(digest, Some(from)).await?),
+            Err(_) => self.library.controller(reference),
         }
     }
 

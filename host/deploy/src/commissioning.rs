@@ -20,7 +20,9 @@ use crate::{error::Error, limits::FIELD_EVENTS, view::PointView};
 
 mod forces;
 mod jobs;
+mod marks;
 mod points;
+mod standby;
 
 pub use bumpless_io::{modbus::Table, scan::ScanPlan};
 pub use forces::{ForceDraft, ForceView};
@@ -47,6 +49,8 @@ pub(crate) enum FieldAsk {
     Job(u64),
     /// End one; who asks.
     CancelJob(u64, String),
+    /// To the other master of a device: the newest wishes about forces that the asker knows.
+    Forces(Vec<marks::SharedMark>),
 }
 
 /// What an I/O host answers.
@@ -58,6 +62,8 @@ pub(crate) enum FieldTold {
     Buses(Vec<BusView>),
     /// Jobs.
     Jobs(Vec<JobView>),
+    /// What this host knows better of forces.
+    Forces(Vec<marks::SharedMark>),
 }
 
 /// A bus as its host sees it.
@@ -87,8 +93,21 @@ pub struct BusView {
     pub jobs: Vec<(String, String)>,
     /// Jobs that wait or run.
     pub jobs_waiting: u32,
-    /// Of a device with two masters: the other host, and the number of the mastership while this host has it.
-    pub master: Option<(String, Option<u32>)>,
+    /// Of a device with two masters: this host's part.
+    pub master: Option<MasterPart>,
+}
+
+/// The part of a host in a device with two masters.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct MasterPart {
+    /// The other host.
+    pub with: String,
+    /// The number of the mastership, while this host has it.
+    pub epoch: Option<u32>,
+    /// Its own connection works: it is master, or could take over.
+    pub ready: bool,
+    /// Forces of the device's points that this host knows of; the same on both hosts, a moment after one began or ended.
+    pub forces: u32,
 }
 
 /// What happened to a point or a job. A feed that lags loses the oldest.
@@ -125,12 +144,26 @@ pub enum FieldEvent {
         /// By whom.
         by: String,
     },
+    /// A host that stands by for another's device can take it over no more, or can again.
+    Standby {
+        /// The bus.
+        bus: String,
+        /// The host that stands by.
+        host: HostId,
+        /// The one that it stands by for.
+        with: HostId,
+        /// It could take over.
+        ready: bool,
+        /// Why not; empty where it could.
+        reason: String,
+    },
 }
 
 /// What a host keeps of it.
 pub(crate) struct Commissioning {
     forces: forces::Forces,
     jobs: jobs::Jobs,
+    standbys: standby::Standbys,
     events: broadcast::Sender<FieldEvent>,
 }
 
@@ -140,6 +173,7 @@ impl Commissioning {
         Ok(Self {
             forces: forces::Forces::open(store)?,
             jobs: jobs::Jobs::new(store.count_up("jobs-start")?, clock),
+            standbys: standby::Standbys::default(),
             events: broadcast::Sender::new(FIELD_EVENTS),
         })
     }

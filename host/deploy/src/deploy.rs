@@ -192,9 +192,9 @@ impl Deploy {
     pub async fn apply_if(&self, mut draft: LoopDraft, expect: Expect) -> Result<ApplyEnd, Error> {
         let id = plan::loop_id(&draft.name)?;
         // By digest, for the home may not have heard of the component yet.
-        draft.component = self.room.library.resolve(&draft.component)?.digest.to_string();
+        draft.component = self.room.library.controller(&draft.component)?.digest.to_string();
         if let Some(fallback) = &mut draft.fallback {
-            *fallback = self.room.library.resolve(fallback)?.digest.to_string();
+            *fallback = self.room.library.controller(fallback)?.digest.to_string();
         }
         let home = match self.room.book.get(&id) {
             Some(intent) => intent.home.clone(),
@@ -359,7 +359,7 @@ impl Deploy {
     /// # Errors
     /// As [`Deploy::apply_if`].
     pub async fn swap_if(&self, id: &LoopId, component: &str, expect: Expect) -> Result<ApplyEnd, Error> {
-        let digest = self.room.library.resolve(component)?.digest;
+        let digest = self.room.library.controller(component)?.digest;
         self.amended(id, Amend::Swap(digest.to_string()), expect).await
     }
 

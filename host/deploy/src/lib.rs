@@ -67,6 +67,7 @@ pub mod view;
 /// The target of the spans that say how long the parts of a change take. They are for a collector; see `bumpless-telemetry`.
 pub const SPANS: &str = "bumpless::spans";
 
+pub use bumpless_cell::Knock;
 pub use bumpless_store::Window;
 pub use deploy::Deploy;
 pub use draft::{Change, LoopDraft};
@@ -74,6 +75,7 @@ pub use error::{Error, Words};
 pub use expect::Expect;
 pub use field::{CallSink, CommandSink, Field, WithdrawSink};
 pub use health::{Check, HealthView};
+pub use library::plant_bytes;
 pub use room::{DeployArrival, Parts};
 pub use view::{
     ApplyEnd, Call, CallEnd, CommandEnd, ComponentView, Counters, DrainEnd, DrainOrder, FailureView, HandOverView,

@@ -47,6 +47,45 @@ pub(crate) fn title(info: &ComponentInfo) -> String {
     format!("{}@{}", info.name, info.version)
 }
 
+/// A component that a loop can run; or why it cannot.
+pub(crate) fn as_controller(info: Arc<ComponentInfo>) -> Result<Arc<ComponentInfo>, Error> {
+    if info.is_plant() {
+        return Err(Error::invalid(
+            format!("{} is a plant, and no controller", title(&info)),
+            format!("a simulated bus runs it: plant = \"library:{}\"", info.name),
+        ));
+    }
+    Ok(info)
+}
+
+/// The bytes of a plant of the library that is on this disk, for a simulated bus that names it: by name, `name@version`, or
+/// digest. Blocks.
+///
+/// # Errors
+/// [`Error::NotFound`], [`Error::Refused`] where the reference means more than one, [`Error::Invalid`] for a controller,
+/// [`Error::Store`].
+pub fn plant_bytes(store: &Store, reference: &str) -> Result<Vec<u8>, Error> {
+    let info = Library::open(store.clone())?.resolve(reference).map_err(|error| match error {
+        Error::NotFound(words) => Error::not_found(
+            words.reason,
+            "upload it at any host of the cell while this one runs, without the bus for the first time; then start this one again",
+        ),
+        other => other,
+    })?;
+    if !info.is_plant() {
+        return Err(Error::invalid(
+            format!("{} is a controller, and no plant", title(&info)),
+            "name a component of the world plant",
+        ));
+    }
+    store.component(&info.digest)?.ok_or_else(|| {
+        Error::not_found(
+            format!("the bytes of {} are not on this disk", title(&info)),
+            "upload it again",
+        )
+    })
+}
+
 /// A version's numbers, for the order. The descriptor's check has made sure that there are three.
 fn numbers(version: &str) -> Vec<u64> {
     version.split('.').map(|part| part.parse().unwrap_or(0)).collect()
@@ -165,6 +204,11 @@ impl Library {
                 Err(Error::not_found(format!("there is no component {short:?}"), cure))
             }
         }
+    }
+
+    /// As [`Library::resolve`], of something that a loop can run.
+    pub(crate) fn controller(&self, reference: &str) -> Result<Arc<ComponentInfo>, Error> {
+        as_controller(self.resolve(reference)?)
     }
 
     /// May this component come in by upload? `Ok(Some)` where it is there already.

@@ -216,6 +216,9 @@ pub const FIELD_EVENTS: usize = 1_024;
 /// How often forces are looked at: one that is over counts no more in any case, this only says so.
 pub const FORCES_LOOK: Duration = Duration::from_secs(1);
 
+/// How long the other master of a device may take to answer about forces: whoever forces a point waits for it.
+pub const FORCE_SHARE_WAIT: Duration = Duration::from_secs(1);
+
 /// Characters of a name or a reason that people give.
 pub const WORDS_CHARS_MAX: usize = 200;
 

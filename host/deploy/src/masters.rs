@@ -72,6 +72,10 @@ impl Room {
             self.spawn(async move {
                 while epoch.changed().await.is_ok() {
                     tracing::info!(%bus, epoch = ?*epoch.borrow(), "the mastership changed");
+                    if let Some(io) = &room.io {
+                        // What people force, this host knows too: before a loop writes here.
+                        io.hold_forced(io.clock().now_ns());
+                    }
                     room.poke();
                 }
             });

@@ -279,6 +279,7 @@ impl Room {
         room.spawn(Self::watch_alarms(Arc::clone(&room), room.feed.subscribe()));
         room.resume_rollouts()?;
         room.resume_forces()?;
+        room.spawn(Self::watch_queues(Arc::clone(&room)));
         room.watch_masters();
         Ok(room)
     }

@@ -4,7 +4,7 @@
 
 use std::sync::Arc;
 
-use bumpless_core::{Cycle, Descriptor, Frame, Mode, NoData, Reading};
+use bumpless_core::{Cycle, Descriptor, Frame, Mode, Reading};
 use bumpless_io::{IoServer, PointInfo};
 use futures_util::future::join_all;
 use tokio::{sync::oneshot, time::timeout};
@@ -18,18 +18,6 @@ use crate::{
     view::{Call, CallEnd, PointView},
     wire::{Ask, Told},
 };
-
-/// Why there is no value, in words.
-fn words(reason: NoData) -> String {
-    match reason {
-        NoData::NeverRead => "not read since the host started".to_owned(),
-        NoData::CommsLost => "the device does not answer".to_owned(),
-        NoData::DeviceError(code) => format!("the device answered with error {code}"),
-        NoData::OutOfRange => "the raw value is outside what the instrument can send".to_owned(),
-        NoData::NotFinite => "the value is not a finite number".to_owned(),
-        NoData::NotConnected => "not connected".to_owned(),
-    }
-}
 
 impl Room {
     /// A page of this host's points.
@@ -73,7 +61,7 @@ impl Room {
             writable: info.writable,
             value: ever.then(|| reading.value_or_last()),
             quality: reading.quality,
-            reason: reading.value.err().map(words).unwrap_or_default(),
+            reason: reading.value.err().map(|reason| reason.to_string()).unwrap_or_default(),
             age_ms: if ever {
                 now_ns.saturating_sub(reading.at_ns) / 1_000_000
             } else {
@@ -129,7 +117,7 @@ impl Room {
                 "choose another strategy",
             ));
         }
-        let info = self.library.resolve(&call.component)?;
+        let info = self.library.controller(&call.component)?;
         let descriptor = &info.descriptor;
         let (frame, track) = frame(&call, descriptor, self.clock.now_ns())?;
         let parameters = descriptor

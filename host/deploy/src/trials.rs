@@ -22,7 +22,7 @@ use crate::{
     bench::{stopping, wire_up},
     book::on_disk,
     error::Error,
-    library::title,
+    library::{as_controller, title},
     limits::{
         RECORDS_TOLD_BYTES_MAX, RECORDS_TOLD_MAX, REHEARSAL_TIME_MAX, REHEARSAL_TURN_WAIT, REHEARSED_MAX,
         SHADOW_CYCLES_MAX,
@@ -261,8 +261,8 @@ impl Room {
         let current = self.ours(id)?.current.clone();
         let info = match trial.component.parse() {
             // By digest also where only the asker has heard of it yet.
-            Ok(digest) => self.info_of(digest, Some(from)).await?,
-            Err(_) => self.library.resolve(&trial.component)?,
+            Ok(digest) => as_controller(self.info_of(digest, Some(from)).await?)?,
+            Err(_) => self.library.controller(&trial.component)?,
         };
         let old = self.info_of(current.digest, None).await.ok();
         let mut swapped = plan::swap(

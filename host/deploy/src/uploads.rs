@@ -9,15 +9,16 @@ use std::{collections::BTreeMap, sync::Arc};
 
 use bumpless_core::{
     ComponentInfo, Digest,
-    component::{CONTROLLER_WORLD, check_labels},
+    component::{CONTROLLER_WORLD, PLANT_WORLD, check_labels},
     limits::TEXT_CHARS_MAX,
 };
+use bumpless_engine::Either;
 use tokio::time::timeout;
 use tracing::{Instrument as _, info_span};
 
 use crate::{
     SPANS,
-    admission::let_in,
+    admission::{let_in, plant_descriptor},
     bench::{engine_error, stopping},
     book::on_disk,
     bundle,
@@ -63,7 +64,7 @@ impl Room {
         Ok(info)
     }
 
-    /// Everything before the decision: whether it is a controller, whether there may be one of its name, how its trial
+    /// Everything before the decision: whether it is a controller or a plant, whether there may be one of its name, how its trial
     /// went. `true` where the library has it already.
     async fn examined(self: &Arc<Self>, bytes: &Arc<[u8]>, upload: &Upload) -> Result<(ComponentInfo, bool), Error> {
         check_words(&upload.by, &upload.note)?;
@@ -85,22 +86,25 @@ impl Room {
         }
         let (engine, copy) = (self.bench.engine.clone(), Arc::clone(bytes));
         // Inspected here, compiled in a process of its own.
-        let (inspection, prepared) = on_disk(move || engine.open(&copy))
+        let opened = on_disk(move || engine.open_either(&copy))
             .instrument(info_span!(target: SPANS, "compile"))
             .await?
             .map_err(|error| engine_error(&error))?;
-        let (name, version) = (
-            inspection.descriptor.name.clone(),
-            inspection.descriptor.version.clone(),
-        );
+        let (descriptor, world, imports) = match &opened {
+            Either::Controller(inspection, _) => {
+                let imports = inspection.imports.clone();
+                (inspection.descriptor.clone(), CONTROLLER_WORLD, imports)
+            }
+            Either::Plant(plant, _) => (plant_descriptor(plant.info()), PLANT_WORLD, plant.imports().to_vec()),
+        };
         let mut info = ComponentInfo {
-            digest: inspection.digest,
-            name,
-            version,
-            descriptor: inspection.descriptor,
-            world: CONTROLLER_WORLD.to_owned(),
-            imports: inspection.imports,
-            bytes: inspection.bytes as u64,
+            digest,
+            name: descriptor.name.clone(),
+            version: descriptor.version.clone(),
+            descriptor,
+            world: world.to_owned(),
+            imports,
+            bytes: bytes.len() as u64,
             uploaded_at_unix_ms: self.clock.unix_ms(),
             uploaded_by: upload.by.clone(),
             note: upload.note.clone(),
@@ -114,8 +118,14 @@ impl Room {
             return Ok((info, true));
         }
         tracing::Span::current().record("name", title(&info));
-        let trial = self.tried(prepared, &info.imports, inspection.compile_time);
-        let admission = trial.instrument(info_span!(target: SPANS, "trial")).await?;
+        let span = info_span!(target: SPANS, "trial");
+        let admission = match opened {
+            Either::Controller(inspection, prepared) => {
+                let trial = self.tried(prepared, &info.imports, inspection.compile_time);
+                trial.instrument(span).await?
+            }
+            Either::Plant(plant, compile_time) => self.tried_plant(plant, compile_time).instrument(span).await?,
+        };
         info.admission = Some(admission);
         info.check().map_err(|error| Error::invalid(error.to_string(), ""))?;
         Ok((info, false))
@@ -162,7 +172,9 @@ impl Room {
         };
         self.announce(&Notice::Component(info.digest, info.edition()));
         // Ready here at once, so that what is uploaded can be called. A full engine is told when it matters.
-        if let Err(error) = self.prepared(info.digest, None).await {
+        if !info.is_plant()
+            && let Err(error) = self.prepared(info.digest, None).await
+        {
             tracing::warn!(digest = %info.digest, %error, "an uploaded component is not ready here yet");
         }
         Ok(info)

@@ -15,7 +15,7 @@ use wasmtime::component::Component;
 
 use crate::{
     Capacity, Config, Error, Inspection, Prepared, PreparedPlant, Profile,
-    admission::check_bytes,
+    admission::{check_bytes, check_plant_export},
     cache::{Cache, deserialize},
     capacity::{Places, Turnstile},
     compile::compile,
@@ -41,6 +41,15 @@ struct Shared {
     /// One compilation at a time: each may take gigabytes.
     compilations: Turnstile,
     prepared: Mutex<HashMap<Digest, Arc<Prepared>>>,
+}
+
+/// What a component is.
+#[derive(Debug)]
+pub enum Either {
+    /// What loops run: inspected, and ready for a trial.
+    Controller(Inspection, Arc<Prepared>),
+    /// What simulated buses run, and how long its compilation took where there was one.
+    Plant(Arc<PreparedPlant>, Option<Duration>),
 }
 
 impl Engine {
@@ -176,6 +185,39 @@ impl Engine {
     pub fn open_plant(&self, bytes: &[u8]) -> Result<Arc<PreparedPlant>, Error> {
         let (plant, _) = self.make_as(bytes, PreparedPlant::new)?;
         Ok(Arc::new(plant))
+    }
+
+    /// A component of either world, ready for a trial: what somebody uploads says itself what it is. `imports` are those of
+    /// its own list.
+    ///
+    /// # Errors
+    /// As [`Engine::inspect`]; what is neither is told as no controller.
+    pub fn open_either(&self, bytes: &[u8]) -> Result<Either, Error> {
+        enum Made {
+            Controller(Prepared),
+            Plant(PreparedPlant),
+        }
+        let new = |core: Arc<Core>, digest, component: &Component| {
+            if check_plant_export(component).is_ok() {
+                PreparedPlant::new(core, digest, component).map(Made::Plant)
+            } else {
+                Prepared::new(core, digest, component).map(Made::Controller)
+            }
+        };
+        let (made, compile_time) = self.make_as(bytes, new)?;
+        Ok(match made {
+            Made::Controller(prepared) => {
+                let inspection = Inspection {
+                    digest: *prepared.digest(),
+                    descriptor: prepared.descriptor().clone(),
+                    imports: prepared.imports().to_vec(),
+                    bytes: bytes.len(),
+                    compile_time,
+                };
+                Either::Controller(inspection, Arc::new(prepared))
+            }
+            Made::Plant(prepared) => Either::Plant(Arc::new(prepared), compile_time),
+        })
     }
 
     /// From bytes to a described controller; with the time of the compilation where there was one.

@@ -40,7 +40,7 @@ pub use cache::cache_key;
 pub use capacity::Capacity;
 pub use compile::precompile;
 pub use config::{Compile, Config, Limits};
-pub use engine::Engine;
+pub use engine::{Either, Engine};
 pub use error::Error;
 pub use instance::{Instance, Origin};
 pub use plant::{PlantInfo, PlantInstance, PlantRole, PlantSignal, PlantView, PreparedPlant};

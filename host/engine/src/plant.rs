@@ -171,13 +171,14 @@ pub struct PreparedPlant {
     core: Arc<Core>,
     digest: Digest,
     info: PlantInfo,
+    imports: Vec<String>,
     pre: PlantPre<Sandbox>,
 }
 
 impl PreparedPlant {
     /// Checks and links a compiled component and lets it say what it is.
     pub(crate) fn new(core: Arc<Core>, digest: Digest, component: &Component) -> Result<Self, Error> {
-        check_imports(component)?;
+        let imports = check_imports(component)?;
         check_plant_export(component)?;
         check_needs(component, &core.limits)?;
         let world = |error: wasmtime::Error| Error::PlantWorld { reason: brief(&error) };
@@ -188,6 +189,7 @@ impl PreparedPlant {
             core,
             digest,
             info,
+            imports,
             pre,
         })
     }
@@ -202,6 +204,12 @@ impl PreparedPlant {
     #[must_use]
     pub const fn info(&self) -> &PlantInfo {
         &self.info
+    }
+
+    /// Interfaces that it imports, in its own order.
+    #[must_use]
+    pub fn imports(&self) -> &[String] {
+        &self.imports
     }
 
     /// A plant of its own.

@@ -78,6 +78,9 @@ pub const RETRIES_MAX: u8 = 5;
 /// Bits per second of a serial line.
 pub const BAUD_RANGE: (u32, u32) = (300, 4_000_000);
 
+/// Pause between two looks at an address that the device says it does not have, in ms, where its neighbours are read without it.
+pub const REFUSED_AGAIN_MS: u64 = 5_000;
+
 /// Requests in a row that were not answered, after which a connection is made anew: the device may have forgotten it.
 pub const SILENT_IN_ROW_MAX: u32 = 3;
 

@@ -123,12 +123,20 @@ pub(crate) fn lease_clock_ns() -> u64 {
 #[derive(Debug, Default)]
 pub(crate) struct Mastership {
     until_ns: AtomicU64,
+    /// When the lease's registers were read or written well last; 0 for never.
+    reached_ns: AtomicU64,
 }
 
 impl Mastership {
     /// May the device be written now? Right before each write; one look at the clock.
     pub(crate) fn may_write(&self) -> bool {
         lease_clock_ns() < self.until_ns.load(SeqCst)
+    }
+
+    /// Were the lease's registers reached within this time? Then this host could take the device over.
+    pub(crate) fn reached_within(&self, ns: u64) -> bool {
+        let reached_ns = self.reached_ns.load(SeqCst);
+        reached_ns > 0 && lease_clock_ns().saturating_sub(reached_ns) <= ns
     }
 }
 
@@ -139,6 +147,8 @@ pub struct MasterView {
     pub with: HostId,
     /// The number of the mastership, while this host has it.
     pub epoch: Option<u32>,
+    /// This host reaches the device, and within its last lease's time the lease's registers: it is master, or could be.
+    pub ready: bool,
 }
 
 /// What keeps the lease up.
@@ -240,6 +250,9 @@ impl Keeper {
             Err(error) => Err(error.to_string()),
         };
         let now_ns = lease_clock_ns();
+        if answer.is_ok() {
+            self.mastership.reached_ns.store(now_ns, SeqCst);
+        }
         match (step, answer) {
             (LeaseStep::Read, Ok(words)) => match <[u16; 3]>::try_from(words) {
                 Ok(words) => lease.read(sent_ns, now_ns, Token::of(words)),

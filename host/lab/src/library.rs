@@ -17,6 +17,8 @@ use crate::{error::Error, limits::CALL_NS_MAX};
 
 /// Where the plants lie in a folder of components.
 const PLANTS: &str = "plants";
+/// What stands before the name of a plant that was uploaded.
+const UPLOADED: &str = "library:";
 /// Longest time of one advance of a plant on a live host, in ns: its thread is its own, and its next step is due soon.
 const LIVE_CALL_NS_MAX: u64 = 200_000_000;
 
@@ -26,7 +28,11 @@ pub struct Library {
     folders: Vec<PathBuf>,
     controllers: Mutex<HashMap<String, Arc<Prepared>>>,
     plants: Mutex<HashMap<String, Arc<PreparedPlant>>>,
+    uploaded: Option<Uploaded>,
 }
+
+/// Bytes of a plant that was uploaded, by what an engineer calls it; or why there are none, in words.
+type Uploaded = Box<dyn Fn(&str) -> Result<Vec<u8>, String> + Send + Sync>;
 
 impl std::fmt::Debug for Library {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
@@ -45,7 +51,15 @@ impl Library {
             folders,
             controllers: Mutex::default(),
             plants: Mutex::default(),
+            uploaded: None,
         }
+    }
+
+    /// With a way to plants that were uploaded: `library:NAME`, `library:NAME@VERSION` or `library:DIGEST` asks it.
+    #[must_use]
+    pub fn with_uploaded(mut self, uploaded: impl Fn(&str) -> Result<Vec<u8>, String> + Send + Sync + 'static) -> Self {
+        self.uploaded = Some(Box::new(uploaded));
+        self
     }
 
     /// The file of a component. A name with a dot or a slash is a path.
@@ -111,7 +125,20 @@ impl Library {
         if let Some(found) = self.plants.lock().unwrap_or_else(PoisonError::into_inner).get(name) {
             return Ok(Arc::clone(found));
         }
-        let bytes = self.bytes("plant", name)?;
+        let bytes = match name.strip_prefix(UPLOADED) {
+            None => self.bytes("plant", name)?,
+            Some(reference) => match &self.uploaded {
+                Some(uploaded) => {
+                    uploaded(reference).map_err(|problem| Error::at(format!("plant {name:?}"), problem))?
+                }
+                None => {
+                    return Err(Error::at(
+                        format!("plant {name:?}"),
+                        "the library of a cell is asked by its hosts alone; here write the path of the component's file",
+                    ));
+                }
+            },
+        };
         let prepared = self.engine.open_plant(&bytes).map_err(|source| Error::Component {
             what: "plant",
             name: name.to_owned(),
@@ -163,12 +190,13 @@ impl Library {
     }
 }
 
-/// Models for simulated buses of a live host: `component:NAME` or `component:PATH`.
+/// Models for simulated buses of a live host: `component:NAME`, `component:PATH`, or `library:` and a reference.
 impl ModelMaker for Library {
     fn make(&self, model: &str, constants: &BTreeMap<String, f64>, seed: u64) -> Result<Box<dyn Model>, String> {
-        let name = model
-            .strip_prefix("component:")
-            .ok_or_else(|| format!("plant = {model:?} is unknown: write component:NAME, component:PATH, or a table"))?;
+        let uploaded = model.starts_with(UPLOADED).then_some(model);
+        let name = uploaded.or_else(|| model.strip_prefix("component:")).ok_or_else(|| {
+            format!("plant = {model:?} is unknown: write component:NAME, component:PATH, library:NAME, or a table")
+        })?;
         self.model_within(name, constants, seed, LIVE_CALL_NS_MAX)
             .map_err(|error| {
                 let mut text = error.to_string();

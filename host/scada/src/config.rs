@@ -25,7 +25,11 @@
 //! writable = true
 //! low = 0.0                        # narrower than the loop's own limits, if wanted
 //! high = 2.0
+//! write_roles = ["operator"]       # with TLS: only clients whose certificate has one of these roles may write it
 //! ```
+//!
+//! With TLS, `read_roles` and `write_roles` beside `listen` say which roles may ask at all, and which may write the entries
+//! that name none of their own. A client of another role, or of none, gets exception 1.
 //!
 //! Addresses that are not mapped answer with exception 2. Unknown keys are errors.
 
@@ -65,6 +69,12 @@ pub struct ModbusServerConfig {
     /// Encrypted, with clients that show a certificate.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub tls: Option<ServerTls>,
+    /// Roles whose clients may ask anything; empty for every client.
+    #[serde(default)]
+    pub read_roles: Vec<String>,
+    /// Roles whose clients may write what is writable and names no roles of its own; empty for every client.
+    #[serde(default)]
+    pub write_roles: Vec<String>,
     /// What is where.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub map: Vec<EntryConfig>,
@@ -161,6 +171,9 @@ pub struct EntryConfig {
     /// May clients write it?
     #[serde(default)]
     pub writable: bool,
+    /// Roles whose clients may write it, if not the server's.
+    #[serde(default)]
+    pub write_roles: Option<Vec<String>>,
     /// Least value that clients may write.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub low: Option<f64>,

@@ -169,6 +169,15 @@ impl Registers for Face {
         }
     }
 
+    fn admits(&self, client: &Client) -> Result<(), Exception> {
+        if self.map.admits(client.role.as_deref()) {
+            return Ok(());
+        }
+        // Each of its requests would be a line.
+        tracing::debug!(server = %self.name, %client, "refused: its role may not ask anything");
+        Err(Exception::FUNCTION)
+    }
+
     fn bits(&self, table: Table, start: u16, count: u16) -> Result<Vec<bool>, Exception> {
         self.map.bits(table, start, count, |entry| self.shown(entry))
     }
@@ -179,7 +188,7 @@ impl Registers for Face {
 
     fn write(&self, client: &Client, write: Write) -> Writing {
         // All of it is checked before the first of it is done.
-        let orders: Result<Vec<Order>, Refusal> = self.map.wishes(&write).map(|wishes| {
+        let orders: Result<Vec<Order>, Refusal> = self.map.wishes(&write, client.role.as_deref()).map(|wishes| {
             let order = |wish: crate::map::Wish<'_>| Order {
                 name: wish.entry.name(),
                 source: wish.entry.source.clone(),

@@ -14,3 +14,6 @@ pub const IDLE_S_RANGE: (u64, u64) = (1, 86_400);
 
 /// Time between two looks at points of other hosts, in ms.
 pub const REFRESH_MS_RANGE: (u64, u64) = (50, 60_000);
+
+/// Roles of a server or an entry: a plant has a handful.
+pub(crate) const ROLES_MAX: usize = 16;

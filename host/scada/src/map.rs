@@ -5,12 +5,12 @@
 use std::collections::BTreeMap;
 
 use bumpless_core::{LoopId, PointId};
-use bumpless_io::modbus::{ByteOrder, Exception, Table, ValueType, WordOrder, server::Write};
+use bumpless_io::modbus::{ByteOrder, Exception, ROLE_CHARS_MAX, Table, ValueType, WordOrder, is_role, server::Write};
 
 use crate::{
     config::{EntryConfig, Item, ModbusServerConfig, OnBad},
     error::Error,
-    limits::{CONNECTIONS_RANGE, ENTRIES_MAX, IDLE_S_RANGE, REFRESH_MS_RANGE},
+    limits::{CONNECTIONS_RANGE, ENTRIES_MAX, IDLE_S_RANGE, REFRESH_MS_RANGE, ROLES_MAX},
 };
 
 /// Who has a value.
@@ -35,6 +35,8 @@ pub(crate) struct Entry {
     offset: f64,
     low: f64,
     high: f64,
+    /// Empty for every client.
+    write_roles: Vec<String>,
 }
 
 /// A value as the cell has it.
@@ -68,6 +70,7 @@ pub(crate) struct Map {
     on_bad: OnBad,
     unit_ids: Vec<u8>,
     any_writable: bool,
+    read_roles: Vec<String>,
 }
 
 impl Map {
@@ -99,12 +102,27 @@ impl Map {
                 config.map.len()
             ));
         }
+        let (least, most) = (1, ROLES_MAX);
+        let own = config.map.iter().filter_map(|entry| entry.write_roles.as_ref());
+        for roles in own.chain([&config.read_roles, &config.write_roles]) {
+            if roles.len() > most || !roles.iter().all(|role| is_role(role)) {
+                return wrong(format!(
+                    "roles {roles:?}: at most {most}, each of {least} to {ROLE_CHARS_MAX} characters, as in the clients' certificates"
+                ));
+            }
+            if !roles.is_empty() && config.tls.is_none() {
+                return wrong(format!(
+                    "roles {roles:?} are in clients' certificates; add [modbus_server.tls] or remove them"
+                ));
+            }
+        }
         let mut map = Self {
             entries: BTreeMap::new(),
             points: Vec::new(),
             on_bad: config.on_bad,
             unit_ids: config.unit_ids.clone(),
             any_writable: config.map.iter().any(|entry| entry.writable),
+            read_roles: config.read_roles.clone(),
         };
         let mut slots: BTreeMap<PointId, usize> = BTreeMap::new();
         for entry in &config.map {
@@ -144,6 +162,11 @@ impl Map {
     /// The points that it shows, by their slots.
     pub(crate) fn points(&self) -> &[PointId] {
         &self.points
+    }
+
+    /// May a client of this role ask anything?
+    pub(crate) fn admits(&self, role: Option<&str>) -> bool {
+        may(&self.read_roles, role)
     }
 
     /// Is the server this unit?
@@ -200,7 +223,7 @@ impl Map {
     }
 
     /// What a write means: every address mapped, writable and whole, every value in its range; or why not.
-    pub(crate) fn wishes(&self, write: &Write) -> Result<Vec<Wish<'_>>, Refusal> {
+    pub(crate) fn wishes(&self, write: &Write, role: Option<&str>) -> Result<Vec<Wish<'_>>, Refusal> {
         let refused = |exception, reason: String| Err(Refusal { exception, reason });
         if !self.any_writable {
             return refused(Exception::FUNCTION, "nothing of this server may be written".to_owned());
@@ -212,7 +235,7 @@ impl Map {
                     let Some(entry) = self.entries.get(&(Table::Coil, address)) else {
                         return refused(Exception::ADDRESS, format!("coil {address} is not mapped"));
                     };
-                    wishes.push(entry.wish(Table::Coil, address, f64::from(u8::from(*on)))?);
+                    wishes.push(entry.wish(Table::Coil, address, f64::from(u8::from(*on)), role)?);
                 }
             }
             Write::Registers { start, words } => {
@@ -232,7 +255,7 @@ impl Map {
                     };
                     let raw = entry.value_type.decode(own, entry.word_order, entry.byte_order);
                     let value = raw.map_or(f64::NAN, |raw| raw * entry.scale + entry.offset);
-                    wishes.push(entry.wish(Table::Holding, first, value)?);
+                    wishes.push(entry.wish(Table::Holding, first, value, role)?);
                     rest = behind;
                     address += count as u32;
                 }
@@ -248,6 +271,11 @@ impl Map {
         let covers = *found == table && address - first < entry.addresses(table);
         covers.then_some((*first, entry))
     }
+}
+
+/// Is a client's role among these? No roles mean every client.
+fn may(roles: &[String], role: Option<&str>) -> bool {
+    roles.is_empty() || role.is_some_and(|role| roles.iter().any(|one| one == role))
 }
 
 /// Addresses from `start` on, not beyond the last.
@@ -285,12 +313,24 @@ impl Entry {
             .to_vec()
     }
 
-    fn wish(&self, table: Table, address: u16, value: f64) -> Result<Wish<'_>, Refusal> {
+    fn wish(&self, table: Table, address: u16, value: f64, role: Option<&str>) -> Result<Wish<'_>, Refusal> {
         let refused = |exception, reason| Err(Refusal { exception, reason });
         if !self.writable {
             return refused(
                 Exception::FAILURE,
                 format!("{} {address} ({}) may not be written", table.name(), self.name()),
+            );
+        }
+        if !may(&self.write_roles, role) {
+            return refused(
+                Exception::FUNCTION,
+                format!(
+                    "{} {address} ({}) may be written by {}; the client has {}",
+                    table.name(),
+                    self.name(),
+                    self.write_roles.join(", "),
+                    role.unwrap_or("no role")
+                ),
             );
         }
         let fits = match self.item {
@@ -390,6 +430,9 @@ fn checked(
     if !(low.is_finite() && high.is_finite() && low < high) {
         return Err(format!("low = {low} and high = {high} must be finite, low < high"));
     }
+    if !entry.writable && entry.write_roles.is_some() {
+        return Err("write_roles are for what may be written; remove them, or set writable = true".to_owned());
+    }
     if !entry.writable && (entry.low.is_some() || entry.high.is_some()) {
         return Err("low and high bound what clients write; remove them, or set writable = true".to_owned());
     }
@@ -404,6 +447,7 @@ fn checked(
         offset: entry.offset,
         low,
         high,
+        write_roles: entry.write_roles.clone().unwrap_or_else(|| server.write_roles.clone()),
     })
 }
 

@@ -3,7 +3,7 @@
 use bumpless_core::HostId;
 use bumpless_deploy::{
     Error as DeployError,
-    commissioning::{self as model, FieldEvent, ForceView, JobTask, ScanPlan},
+    commissioning::{self as model, ForceView, JobTask, ScanPlan},
 };
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
@@ -128,6 +128,10 @@ pub struct Redundant {
     pub with: String,
     /// The number of the mastership, while this host has it; null while it stands by.
     pub epoch: Option<u32>,
+    /// Its own connection works: it is master, or could take over.
+    pub ready: bool,
+    /// Forces of the device's points that this host knows of; the same on both hosts, a moment after one began or ended.
+    pub forces: u32,
 }
 
 /// A job of a bus's configuration.
@@ -158,7 +162,12 @@ impl From<model::BusView> for Bus {
                 .map(|(name, text)| NamedJob { name, text })
                 .collect(),
             jobs_waiting: view.jobs_waiting,
-            redundant: view.master.map(|(with, epoch)| Redundant { with, epoch }),
+            redundant: view.master.map(|part| Redundant {
+                with: part.with,
+                epoch: part.epoch,
+                ready: part.ready,
+                forces: part.forces,
+            }),
         }
     }
 }
@@ -504,79 +513,6 @@ impl From<model::JobView> for Job {
             asked_unix_ms: view.asked_unix_ms,
             began_unix_ms: view.began_unix_ms,
             ended_unix_ms: view.ended_unix_ms,
-        }
-    }
-}
-
-/// What happened to a point or a job: the data of the live feed's `field` events.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
-#[serde(rename_all = "kebab-case")]
-pub enum FieldNews {
-    /// A job was taken in, began, or ended; without its result.
-    Job(Job),
-    /// A point is held at a value.
-    Forced(PointForced),
-    /// A point is held no more.
-    Unforced(PointUnforced),
-    /// A point was written by hand.
-    Written(PointWritten),
-}
-
-/// A point is held at a value.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
-pub struct PointForced {
-    /// The point.
-    pub point: String,
-    /// Its host.
-    pub host: String,
-    /// The value, by whom, why and until when.
-    pub force: Force,
-}
-
-/// A point is held no more.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
-pub struct PointUnforced {
-    /// The point.
-    pub point: String,
-    /// Its host.
-    pub host: String,
-    /// By whom, or that its time was over.
-    pub by: String,
-}
-
-/// A point was written by hand.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
-pub struct PointWritten {
-    /// The point.
-    pub point: String,
-    /// Its host.
-    pub host: String,
-    /// The value.
-    pub value: Option<f64>,
-    /// By whom.
-    pub by: String,
-}
-
-impl From<FieldEvent> for FieldNews {
-    fn from(event: FieldEvent) -> Self {
-        match event {
-            FieldEvent::Job(view) => Self::Job(view.into()),
-            FieldEvent::Forced { point, host, force } => Self::Forced(PointForced {
-                point: point.to_string(),
-                host: host.to_string(),
-                force: force.into(),
-            }),
-            FieldEvent::Unforced { point, host, by } => Self::Unforced(PointUnforced {
-                point: point.to_string(),
-                host: host.to_string(),
-                by,
-            }),
-            FieldEvent::Written { point, host, value, by } => Self::Written(PointWritten {
-                point: point.to_string(),
-                host: host.to_string(),
-                value: finite(value),
-                by,
-            }),
         }
     }
 }

@@ -365,7 +365,7 @@ impl Record {
                     port: ports.name(port),
                     value: finite(reading.value_or_last()),
                     quality: reading.quality.into(),
-                    reason: reading.value.err().map(reason),
+                    reason: reading.value.err().map(|reason| reason.to_string()),
                     age_ms: (reading.at_ns > 0).then(|| ms(record.at_ns.saturating_sub(reading.at_ns))),
                     fresh: reading.fresh,
                 })
@@ -493,18 +493,6 @@ impl Event {
                 needed: *needed,
             },
         }
-    }
-}
-
-/// Why there is no value, in words.
-fn reason(reason: model::NoData) -> String {
-    match reason {
-        model::NoData::NeverRead => "never read".to_owned(),
-        model::NoData::CommsLost => "the device does not answer".to_owned(),
-        model::NoData::DeviceError(code) => format!("the device answered with error {code}"),
-        model::NoData::OutOfRange => "outside what the instrument can send".to_owned(),
-        model::NoData::NotFinite => "not a finite number".to_owned(),
-        model::NoData::NotConnected => "not connected".to_owned(),
     }
 }
 

@@ -195,9 +195,19 @@ fn buses(client: &Client, json: bool) -> Result<(), Error> {
             bus.host,
             bus.driver,
             match (bus.connected, &bus.redundant) {
+                (false, Some(Redundant { with, epoch: None, .. })) => format!("AWAY, cannot stand by for {with}"),
                 (false, _) => "away".to_owned(),
                 (true, None) => "answers".to_owned(),
-                (true, Some(Redundant { with, epoch: None })) => format!("stands by for {with}"),
+                (
+                    true,
+                    Some(Redundant {
+                        with,
+                        epoch: None,
+                        ready,
+                        ..
+                    }),
+                ) if *ready => format!("stands by for {with}"),
+                (true, Some(Redundant { with, epoch: None, .. })) => format!("cannot stand by for {with}"),
                 (true, Some(Redundant { epoch: Some(epoch), .. })) => format!("master, epoch {epoch}"),
             },
             bus.points.to_string(),

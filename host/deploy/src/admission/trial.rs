@@ -65,7 +65,7 @@ fn own_ns() -> u64 {
         .saturating_add(ns.unwrap_or(0))
 }
 
-fn measured<T>(work: impl FnOnce() -> T) -> (T, u64) {
+pub(super) fn measured<T>(work: impl FnOnce() -> T) -> (T, u64) {
     let from = own_ns();
     let done = work();
     (done, own_ns().saturating_sub(from))

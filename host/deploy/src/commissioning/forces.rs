@@ -5,10 +5,13 @@
 //!          start of the host: from the disk into the image, before any loop runs
 //! ```
 //!
+//! Of a device with two masters both hosts know its forces (`marks`), so that the one that takes over goes on with them, and
+//! what ended at one ends at the other.
+//!
 //! Owns: that a force outlives its host's process and no longer than its time. Never: puts a value anywhere; the I/O server
 //! does, at each read and write, and looks at the time itself.
 
-use std::{collections::BTreeMap, sync::Arc, time::Duration};
+use std::{sync::Arc, time::Duration};
 
 use bumpless_core::PointId;
 use bumpless_io::{Force, IoServer, PointIndex};
@@ -16,7 +19,10 @@ use bumpless_store::Store;
 use parking_lot::Mutex;
 use serde::{Deserialize, Serialize};
 
-use super::FieldEvent;
+use super::{
+    FieldEvent,
+    marks::{Mark, Marks, Position},
+};
 use crate::{
     book::on_disk,
     error::{Error, chain},
@@ -55,28 +61,22 @@ pub struct ForceView {
 
 /// The forces of this host.
 pub(crate) struct Forces {
-    held: Mutex<BTreeMap<PointId, ForceView>>,
+    pub(super) marks: Mutex<Marks>,
     /// Held while one is changed, so that disk and image end up alike.
-    changing: tokio::sync::Mutex<()>,
+    pub(super) changing: tokio::sync::Mutex<()>,
 }
 
 impl Forces {
     /// Reads the disk.
     pub(super) fn open(store: &Store) -> Result<Self, Error> {
         Ok(Self {
-            held: Mutex::new(store.forces()?.into_iter().collect()),
+            marks: Mutex::new(Marks::new(store.forces()?)),
             changing: tokio::sync::Mutex::default(),
         })
     }
 
     pub(super) fn of(&self, point: &PointId) -> Option<ForceView> {
-        let held = self.held.lock();
-        // Mostly there are none, and a list of points asks for each.
-        if held.is_empty() {
-            None
-        } else {
-            held.get(point).cloned()
-        }
+        self.marks.lock().force(point).cloned()
     }
 }
 
@@ -93,7 +93,7 @@ pub(super) fn words(what: &str, text: &str) -> Result<String, Error> {
 }
 
 /// A force as the I/O server takes it.
-fn as_force(view: &ForceView) -> Force {
+pub(super) fn as_force(view: &ForceView) -> Force {
     Force {
         value: view.value,
         until_ns: view.until_unix_ms.saturating_mul(1_000_000),
@@ -105,7 +105,7 @@ impl Room {
     pub(crate) fn resume_forces(self: &Arc<Self>) -> Result<(), Error> {
         let Some(io) = &self.io else { return Ok(()) };
         let now_ns = io.clock().now_ns();
-        let held: Vec<_> = self.commissioning.forces.held.lock().clone().into_iter().collect();
+        let held = self.commissioning.forces.marks.lock().forces();
         for (point, view) in held {
             let resumed = match io.index(&point) {
                 None => Err("the point is no longer there".to_owned()),
@@ -117,7 +117,7 @@ impl Room {
                 Ok(()) => tracing::warn!(%point, value = view.value, by = view.by, "still forced after the start"),
                 Err(reason) => {
                     tracing::warn!(%point, reason, "a force ended while the host was away");
-                    self.commissioning.forces.held.lock().remove(&point);
+                    self.commissioning.forces.marks.lock().forget(&point);
                     self.store.remove_force(&point)?;
                 }
             }
@@ -149,11 +149,24 @@ impl Room {
             }
         }
         io.hold_forced(now_ns);
+        let over = self.commissioning.forces.marks.lock().sweep(now_ns / 1_000_000);
+        for point in over {
+            let store = self.store.clone();
+            if let Ok(Err(error)) = on_disk(move || store.remove_force(&point)).await {
+                // It is forgotten in memory, and again after the next start.
+                tracing::debug!(%error, "the memory of an ended force is still on disk");
+            }
+        }
+        self.look_after_standbys();
+        self.share_forces().await;
     }
 
     /// Holds a point of this host at a value.
     pub(super) async fn force_here(self: &Arc<Self>, point: &PointId, draft: ForceDraft) -> Result<(), Error> {
         let (io, index) = self.point_here(point)?;
+        if !io.speaks_for(index) {
+            return Err(self.not_master(point));
+        }
         let now_ns = io.clock().now_ns();
         let view = ForceView {
             value: draft.value,
@@ -162,7 +175,7 @@ impl Room {
             by: words("by", &draft.by)?,
             why: words("why", &draft.why)?,
         };
-        let _turn = self.commissioning.forces.changing.lock().await;
+        let turn = self.commissioning.forces.changing.lock().await;
         // The I/O server knows the bounds. What it takes is on disk a moment later, before anybody is told.
         let before = io
             .forced()
@@ -171,7 +184,8 @@ impl Room {
             .map(|(_, force)| force);
         io.force(index, as_force(&view), now_ns)
             .map_err(|error| Error::invalid(chain(&error), ""))?;
-        let (store, key, row) = (self.store.clone(), point.clone(), view.clone());
+        let mark = self.mark_now(io, index, point, view.until_unix_ms, Some(view.clone()));
+        let (store, key, row) = (self.store.clone(), point.clone(), mark.clone());
         let kept = match on_disk(move || store.put_force(&key, &row)).await {
             Ok(kept) => kept.map_err(Error::from),
             Err(error) => Err(error),
@@ -184,11 +198,10 @@ impl Room {
             }
             return Err(error);
         }
-        self.commissioning
-            .forces
-            .held
-            .lock()
-            .insert(point.clone(), view.clone());
+        self.commissioning.forces.marks.lock().put(point.clone(), mark);
+        drop(turn);
+        // Told to the other master before the asker hears of it, if it can be reached; else as soon as it can.
+        self.share_forces().await;
         tracing::warn!(%point, value = view.value, seconds = draft.seconds, by = view.by, why = view.why, "forced");
         self.tell_field(FieldEvent::Forced {
             point: point.clone(),
@@ -202,6 +215,9 @@ impl Room {
     pub(super) async fn unforce_here(self: &Arc<Self>, point: &PointId, by: &str) -> Result<(), Error> {
         let by = words("by", by)?;
         let (io, index) = self.point_here(point)?;
+        if !io.speaks_for(index) {
+            return Err(self.not_master(point));
+        }
         if self.commissioning.force_of(point).is_none() {
             return Err(Error::refused(format!("point {point} is not forced"), ""));
         }
@@ -210,31 +226,77 @@ impl Room {
 
     /// Ends a force; `only` where it is still this one.
     async fn end_force(
-        &self,
+        self: &Arc<Self>,
         io: &Arc<IoServer>,
         index: PointIndex,
         point: &PointId,
         by: &str,
         only: Option<Force>,
     ) -> Result<(), Error> {
-        let _turn = self.commissioning.forces.changing.lock().await;
+        let turn = self.commissioning.forces.changing.lock().await;
+        let by_time = only.is_some();
         if let Some(only) = only
             && !io.forced().contains(&(index, only))
         {
             return Ok(());
         }
-        // Off the disk first: what a person was told to be free must not come back with a restart.
-        let (store, key) = (self.store.clone(), point.clone());
-        on_disk(move || store.remove_force(&key)).await??;
+        // Off the disk first: what a person was told to be free must not come back with a restart. Of two masters both
+        // remember the end for as long as the force would have lasted.
+        let ended = self.commissioning.forces.marks.lock().get(point).cloned();
+        let mark = match (io.redundant(index), ended) {
+            (Some(_), Some(ended)) if by_time => Some(ended.over()),
+            (Some(_), Some(ended)) => Some(self.mark_now(io, index, point, ended.over().until_unix_ms, None)),
+            _ => None,
+        };
+        let (store, key, row) = (self.store.clone(), point.clone(), mark.clone());
+        on_disk(move || match row {
+            Some(row) => store.put_force(&key, &row),
+            None => store.remove_force(&key).map(drop),
+        })
+        .await??;
         io.unforce(index);
-        self.commissioning.forces.held.lock().remove(point);
+        match mark {
+            Some(mark) => self.commissioning.forces.marks.lock().put(point.clone(), mark),
+            None => self.commissioning.forces.marks.lock().forget(point),
+        }
+        drop(turn);
         tracing::warn!(%point, by, "forced no more");
+        if by_time && !io.speaks_for(index) {
+            // The master tells.
+            return Ok(());
+        }
+        self.share_forces().await;
         self.tell_field(FieldEvent::Unforced {
             point: point.clone(),
             host: self.here.clone(),
             by: by.to_owned(),
         });
         Ok(())
+    }
+
+    /// A mark for what is said now: newer than all that was said before.
+    fn mark_now(
+        &self,
+        io: &IoServer,
+        index: PointIndex,
+        point: &PointId,
+        until_unix_ms: u64,
+        force: Option<ForceView>,
+    ) -> Mark {
+        let epoch = io.redundant(index).and_then(|(_, view)| view.epoch).unwrap_or(0);
+        let now_ms = io.clock().now_ns() / 1_000_000;
+        let before = self
+            .commissioning
+            .forces
+            .marks
+            .lock()
+            .get(point)
+            .map(|mark| mark.position);
+        Mark {
+            position: Position::after(before, epoch, now_ms),
+            until_unix_ms,
+            force,
+        }
     }
 
     /// Tells everyone, this host included.

@@ -8,7 +8,7 @@ use bumpless_core::{HostId, LoopId, PointId};
 use bumpless_io::{IoServer, PointIndex, WriteStamp};
 use futures_util::future::join_all;
 
-use super::{BusView, FieldAsk, FieldEvent, FieldTold, ForceDraft, forces};
+use super::{BusView, FieldAsk, FieldEvent, FieldTold, ForceDraft, MasterPart, forces};
 use crate::{
     error::{Error, chain},
     limits::ANSWER_WAIT,
@@ -42,6 +42,7 @@ impl Room {
             FieldAsk::Jobs => Ok(FieldTold::Jobs(self.commissioning.jobs.all())),
             FieldAsk::Job(number) => self.job_here(number).map(|job| FieldTold::Jobs(vec![job])),
             FieldAsk::CancelJob(number, by) => self.cancel_job_here(number, &by).map(|job| FieldTold::Jobs(vec![job])),
+            FieldAsk::Forces(marks) => Ok(self.forces_told(marks).await),
         }
     }
 
@@ -129,9 +130,12 @@ impl Room {
                 |(jobs, _)| jobs.iter().map(|job| (job.name.clone(), job.text.clone())).collect(),
             ),
             jobs_waiting: self.commissioning.jobs.waiting(status.bus.as_str()),
-            master: io
-                .master(&status.bus)
-                .map(|master| (master.with.to_string(), master.epoch)),
+            master: io.master(&status.bus).map(|view| MasterPart {
+                with: view.with.to_string(),
+                epoch: view.epoch,
+                ready: view.ready,
+                forces: forced_on(io, &status.bus),
+            }),
         };
         io.status().into_iter().map(view).collect()
     }
@@ -225,6 +229,12 @@ impl Room {
             }
         }
     }
+}
+
+/// Forces on the points of a bus that has two masters.
+fn forced_on(io: &IoServer, bus: &bumpless_core::BusId) -> u32 {
+    let here = |index: PointIndex| io.redundant(index).is_some_and(|(own, _)| own == *bus);
+    io.forced().into_iter().filter(|(index, _)| here(*index)).count() as u32
 }
 
 pub(super) fn unexpected() -> Error {

@@ -2,17 +2,36 @@
 //!
 //! Never: decides; the host of the point or bus does.
 
+use bumpless_cell::Knock;
 use bumpless_core::PointId;
 use tokio::sync::broadcast;
 
 use super::Deploy;
 use crate::{
     commissioning::{BusView, FieldEvent, ForceDraft, JobDraft, JobView},
-    error::Error,
+    error::{Error, chain},
     view::PointView,
 };
 
 impl Deploy {
+    /// Opens a door of this host on the bus, for programs that are no hosts. `answers` must not block.
+    ///
+    /// # Errors
+    /// [`Error::Internal`] with the bus's words.
+    pub fn open_door(&self, door: &str, answers: impl Fn(Knock) + Send + Sync + 'static) -> Result<(), Error> {
+        self.room
+            .session
+            .open_door(door, answers)
+            .map_err(|error| Error::internal(chain(&error)))
+    }
+
+    /// Tells all who listen at a door of this host what became of something. It may be lost; then it can be asked for.
+    pub fn publish_at_door(&self, door: &str, what: &str, json: Vec<u8>) {
+        if let Err(error) = self.room.session.publish_at_door(door, what, json) {
+            tracing::debug!(door, what, %error, "nobody at a door was told");
+        }
+    }
+
     /// One point, as its I/O host sees it.
     ///
     /// # Errors

@@ -63,7 +63,7 @@ impl Deploy {
 
     /// As the home may not have heard of the component yet.
     fn by_digest(&self, mut trial: Trial) -> Result<Trial, Error> {
-        trial.component = self.room.library.resolve(&trial.component)?.digest.to_string();
+        trial.component = self.room.library.controller(&trial.component)?.digest.to_string();
         Ok(trial)
     }
 

@@ -219,7 +219,7 @@ impl Room {
 
     async fn begin_rollout(self: &Arc<Self>, draft: RolloutDraft) -> Result<RolloutView, Error> {
         draft.rule.check()?;
-        let info = self.library.resolve(&draft.component)?;
+        let info = self.library.controller(&draft.component)?;
         let given = draft.parameters.iter().map(|(name, value)| (name.as_str(), *value));
         info.descriptor
             .parameter_values(given)

@@ -25,7 +25,7 @@ use crate::{
     errand::{Asked, Post},
     image::Image,
     limits::CLOSE_WAIT_MS,
-    master::{Keeper, Mastership},
+    master::{Keeper, Mastership, RedundantPlan},
     status::StatusCell,
 };
 
@@ -170,6 +170,18 @@ impl ModbusDriver {
     /// May the device be written by this host now?
     pub(crate) fn may_write(&self) -> bool {
         self.shared.may_write()
+    }
+
+    /// Of a device with two masters: does this host's own connection work, so that it could take over?
+    pub(crate) fn reaches_the_lease(&self) -> bool {
+        let within = |plan: &RedundantPlan, mastership: &Mastership| mastership.reached_within(plan.times.lease_ns);
+        let reached = self
+            .shared
+            .plan
+            .redundant
+            .as_ref()
+            .zip(self.shared.mastership.as_deref());
+        self.status().connected && reached.is_some_and(|(plan, mastership)| within(plan, mastership))
     }
 
     /// The number of the mastership, while this host has it; changes as it goes over. None for a bus with one master.

@@ -27,19 +27,7 @@ impl Exception {
     /// The standard's name.
     #[must_use]
     pub const fn name(self) -> &'static str {
-        match self.0 {
-            1 => "illegal function",
-            2 => "illegal data address",
-            3 => "illegal data value",
-            4 => "server device failure",
-            5 => "acknowledge, still working",
-            6 => "server device busy",
-            7 => "negative acknowledge",
-            8 => "memory parity error",
-            10 => "gateway path unavailable",
-            11 => "gateway target device failed to respond",
-            _ => "unknown to the standard",
-        }
+        bumpless_core::device_error_name(self.0)
     }
 }
 

@@ -96,6 +96,19 @@ impl Group {
     pub fn without_gaps(&self) -> Vec<Self> {
         merged(self.items.clone(), 0)
     }
+
+    /// The same points in smaller requests, where the device does not have an address of this one: without gaps; where there
+    /// are none, in two halves. One part where there is nothing to part: the address is that of its points.
+    #[must_use]
+    pub fn parts(&self) -> Vec<Self> {
+        let mut parts = self.without_gaps();
+        if parts.len() == 1 {
+            let mut items = self.items.clone();
+            let upper = items.split_off(items.len() / 2);
+            parts = [items, upper].into_iter().flat_map(|items| merged(items, 0)).collect();
+        }
+        parts
+    }
 }
 
 /// Merges items of the same unit, table and period whose addresses lie at most `gap_max` apart, within the protocol's
@@ -160,6 +173,16 @@ mod tests {
         let one = merged(items, 5);
         assert_eq!(shapes(&one), [(0, 13, 4)]);
         assert_eq!(shapes(&one[0].without_gaps()), [(0, 5, 2), (10, 3, 2)]);
+    }
+
+    #[test]
+    fn halves_end_at_the_single_point() {
+        let groups = merged((0..5).map(|n| item(n, n as u16, 1)).collect(), 0);
+        assert_eq!(shapes(&groups[0].parts()), [(0, 2, 2), (2, 3, 3)]);
+        assert_eq!(shapes(&groups[0].parts()[1].parts()), [(2, 1, 1), (3, 2, 2)]);
+        assert_eq!(groups[0].parts()[1].parts()[0].parts().len(), 1);
+        let gap = merged(vec![item(0, 0, 1), item(1, 4, 1), item(2, 5, 1)], 10);
+        assert_eq!(shapes(&gap[0].parts()), [(0, 1, 1), (4, 2, 2)], "gaps go first");
     }
 
     #[test]

@@ -36,7 +36,11 @@ use super::{
     request::{Answer, Request},
     serial::Serial,
 };
-use crate::{config::OnStop, errand::Errands, limits::SILENT_IN_ROW_MAX};
+use crate::{
+    config::OnStop,
+    errand::Errands,
+    limits::{REFUSED_AGAIN_MS, SILENT_IN_ROW_MAX},
+};
 
 mod errands;
 mod writes;
@@ -46,6 +50,8 @@ mod writes;
 struct Poll {
     group: Arc<Group>,
     due: Instant,
+    /// It was cut out of a greater one because the device refused an address of that.
+    cut_out: bool,
 }
 
 /// How a connection ended.
@@ -85,17 +91,7 @@ impl Link {
         stop: watch::Receiver<bool>,
         errands: Errands,
     ) -> Self {
-        let now = Instant::now();
-        let polls = shared
-            .plan
-            .groups
-            .iter()
-            .filter(|group| units.contains(&group.unit_id))
-            .map(|group| Poll {
-                group: Arc::new(group.clone()),
-                due: now,
-            })
-            .collect();
+        let polls = planned(&shared.plan, &units);
         let (min_ms, max_ms) = shared.plan.backoff_ms;
         let backoff = Backoff::new(min_ms, max_ms, shared.clock.now_ns().wrapping_add(lane as u64));
         Self {
@@ -155,6 +151,8 @@ impl Link {
             Ok(Ok(connection)) => {
                 self.shared.outbox.forget(self.lane);
                 self.silent_in_row = 0;
+                // Perhaps a device that started again, and has now what it did not have.
+                self.polls = planned(&self.shared.plan, &self.units);
                 self.shared.status.update(|s| s.connections += 1);
                 tracing::info!(bus = %self.shared.plan.bus, address = place, "connected");
                 return Some(connection);
@@ -271,18 +269,24 @@ impl Link {
             Err(Failure::Exception(exception)) => {
                 self.answered(group.unit_id);
                 let parts = if exception == Exception::ADDRESS {
-                    group.without_gaps()
+                    group.parts()
                 } else {
                     Vec::new()
                 };
                 if parts.len() > 1 {
-                    tracing::info!(bus = %self.shared.plan.bus, "{}: read without gaps from now on", place());
+                    // One wrong address must not take its neighbours down: what is left of them in the end is the wrong one.
+                    tracing::info!(bus = %self.shared.plan.bus, "{}: {exception}; read in parts from now on", place());
                     self.polls.swap_remove(number);
                     self.polls.extend(parts.into_iter().map(|group| Poll {
                         group: Arc::new(group),
                         due: now,
+                        cut_out: true,
                     }));
                     return Ok(());
+                }
+                if let Some(poll) = self.polls.get_mut(number).filter(|poll| poll.cut_out) {
+                    // It costs its neighbours a request each time, so it is not asked for often.
+                    poll.due = now + period.max(Duration::from_millis(REFUSED_AGAIN_MS));
                 }
                 self.report(&format!("{}: {exception}", place()));
                 for item in &group.items {
@@ -381,6 +385,8 @@ impl Link {
             if !again {
                 return answer;
             }
+            // Whoever looks must not wait for the tries: the loss shows now, and the value when one of them succeeds.
+            self.lose_read(unit_id, request);
             tries += 1;
         }
     }
@@ -455,6 +461,20 @@ impl Link {
         }
     }
 
+    /// The points of a read that was not answered.
+    fn lose_read(&self, unit_id: u8, request: &Request) {
+        let Request::Read { table, start, count } = request else {
+            return;
+        };
+        let asked = |poll: &&Poll| {
+            let group = &poll.group;
+            (group.unit_id, group.table, group.start, group.count) == (unit_id, *table, *start, *count)
+        };
+        for item in self.polls.iter().filter(asked).flat_map(|poll| &poll.group.items) {
+            self.shared.image.lose(item.point);
+        }
+    }
+
     fn lose_all(&self) {
         for (number, point) in self.shared.plan.points.iter().enumerate() {
             if self.units.contains(&point.unit_id) {
@@ -480,6 +500,18 @@ impl Link {
         // Failures have been reported; there is no later.
         let _ = self.send_writes(connection).await;
     }
+}
+
+/// The groups of these units as they were planned, due now.
+fn planned(plan: &Plan, units: &[u8]) -> Vec<Poll> {
+    let due = Instant::now();
+    let own = plan.groups.iter().filter(|group| units.contains(&group.unit_id));
+    let poll = |group: &Group| Poll {
+        group: Arc::new(group.clone()),
+        due,
+        cut_out: false,
+    };
+    own.map(poll).collect()
 }
 
 /// A connection, or why there is none, in words.

@@ -9,7 +9,7 @@
 //!
 //! Owns: connections, their number and their time. A client's requests are answered one after the other, in order, so
 //! what waits is in the kernel's own bounded buffers. Never: knows what a register means (that is whoever implements
-//! [`Registers`]), or lets a client hold up another.
+//! [`Registers`]), or lets a client hold up another, except for the time of a write: function 22 reads and writes in one.
 
 use std::{
     fmt,
@@ -38,12 +38,15 @@ use super::{
     frame::{Cut, FRAME_BYTES_MAX, cut_header, with_header},
     group::Table,
     request::{Answer, EXCEPTION_BIT, Request},
+    role::role_of,
 };
 use crate::limits::{SERVER_SEND_MS_MAX, SERVER_STOP_MS_MAX};
 
 mod identity;
+mod masks;
 
 pub use identity::Identity;
+pub use masks::Masks;
 
 /// A write on its way; it owns what it needs.
 pub type Writing = Pin<Box<dyn Future<Output = Result<(), Exception>> + Send>>;
@@ -72,11 +75,17 @@ pub enum Write {
 pub struct Client {
     /// Its address.
     pub address: SocketAddr,
+    /// The role in its certificate; none without TLS, or where the certificate has none.
+    pub role: Option<String>,
 }
 
 impl fmt::Display for Client {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        self.address.fmt(f)
+        self.address.fmt(f)?;
+        match &self.role {
+            Some(role) => write!(f, " (role {role})"),
+            None => Ok(()),
+        }
     }
 }
 
@@ -87,6 +96,15 @@ pub trait Registers: Send + Sync + 'static {
     /// # Errors
     /// The exception for the client, where there is none.
     fn unit(&self, unit: u8) -> Result<(), Exception>;
+
+    /// May this client ask anything at all?
+    ///
+    /// # Errors
+    /// The exception for the client; by Modbus/TCP Security, 1 to one whose role may not.
+    fn admits(&self, client: &Client) -> Result<(), Exception> {
+        let _ = client;
+        Ok(())
+    }
 
     /// Coils or discrete inputs. It answers from memory: it never waits.
     ///
@@ -157,6 +175,7 @@ pub async fn serve(
     mut stop: watch::Receiver<bool>,
 ) {
     let places = Arc::new(Semaphore::new(options.connections_max));
+    let masks = Arc::new(Masks::default());
     let mut clients = JoinSet::new();
     let mut full = false;
     loop {
@@ -186,9 +205,10 @@ pub async fn serve(
         full = false;
         counts.accepted.fetch_add(1, Ordering::Relaxed);
         let one = Connected {
-            client: Client { address },
+            client: Client { address, role: None },
             options: options.clone(),
             registers: Arc::clone(&registers),
+            masks: Arc::clone(&masks),
             counts: Arc::clone(&counts),
             stop: stop.clone(),
             _place: place,
@@ -210,6 +230,7 @@ struct Connected {
     client: Client,
     options: ServerOptions,
     registers: Arc<dyn Registers>,
+    masks: Arc<Masks>,
     counts: Arc<ServerCounts>,
     stop: watch::Receiver<bool>,
     _place: OwnedSemaphorePermit,
@@ -236,7 +257,11 @@ impl Connected {
                 };
                 match shaken {
                     None => Ok(End::Done),
-                    Some(Ok(Ok(stream))) => self.talk(stream).await,
+                    Some(Ok(Ok(stream))) => {
+                        let certificates = stream.get_ref().1.peer_certificates();
+                        self.client.role = certificates.and_then(|chain| role_of(chain.first()?));
+                        self.talk(stream).await
+                    }
                     Some(Ok(Err(error))) => Ok(End::NoModbus(format!("TLS: {error}"))),
                     Some(Err(_)) => Ok(End::NoModbus(
                         "TLS: the client did not finish its part in time".to_owned(),
@@ -288,7 +313,7 @@ impl Connected {
                 // At most one frame more than what is looked at, so it stays small.
                 waiting.extend(piece.get(..count).unwrap_or_default());
             };
-            let answer = answer(self.registers.as_ref(), &self.client, unit, &pdu).await;
+            let answer = answer(self.registers.as_ref(), &self.masks, &self.client, unit, &pdu).await;
             self.counts.requests.fetch_add(1, Ordering::Relaxed);
             if answer.first().is_some_and(|function| function & EXCEPTION_BIT != 0) {
                 self.counts.exceptions.fetch_add(1, Ordering::Relaxed);
@@ -308,21 +333,26 @@ impl Connected {
 }
 
 /// The answer to the bytes of one request.
-pub async fn answer(registers: &dyn Registers, client: &Client, unit: u8, pdu: &[u8]) -> Vec<u8> {
+pub async fn answer(registers: &dyn Registers, masks: &Masks, client: &Client, unit: u8, pdu: &[u8]) -> Vec<u8> {
     let function = pdu.first().copied().unwrap_or(0);
     let refused = |exception: Exception| vec![function | EXCEPTION_BIT, exception.0];
-    if let Err(exception) = registers.unit(unit) {
+    if let Err(exception) = registers.admits(client).and_then(|()| registers.unit(unit)) {
         return refused(exception);
     }
     let request = match Request::parse(pdu) {
         Ok(request) => request,
         Err(exception) => return refused(exception),
     };
-    let answered = answered(registers, client, &request).await;
+    let answered = answered(registers, masks, client, &request).await;
     request.respond(&answered)
 }
 
-async fn answered(registers: &dyn Registers, client: &Client, request: &Request) -> Result<Answer, Exception> {
+async fn answered(
+    registers: &dyn Registers,
+    masks: &Masks,
+    client: &Client,
+    request: &Request,
+) -> Result<Answer, Exception> {
     let write = |write: Write| registers.write(client, write);
     match request {
         Request::Read { table, start, count } if table.is_bits() => {
@@ -340,20 +370,29 @@ async fn answered(registers: &dyn Registers, client: &Client, request: &Request)
             Ok(Answer::Done)
         }
         Request::WriteRegister { address, word } => {
+            let _shared = masks.beside(*address, 1).await;
             let words = vec![*word];
             write(Write::Registers { start: *address, words }).await?;
             Ok(Answer::Done)
         }
         Request::WriteRegisters { start, words } => {
+            let _shared = masks.beside(*start, words.len()).await;
             let words = words.clone();
             write(Write::Registers { start: *start, words }).await?;
             Ok(Answer::Done)
         }
         Request::MaskWrite { address, and, or } => {
+            let mut alone = masks.alone().await;
             let held = registers.words(Table::Holding, *address, 1)?;
             let held = held.first().copied().ok_or(Exception::FAILURE)?;
-            let words = vec![(held & and) | (or & !and)];
-            write(Write::Registers { start: *address, words }).await?;
+            let base = alone.base(*address, held, Instant::now());
+            let word = (base & and) | (or & !and);
+            write(Write::Registers {
+                start: *address,
+                words: vec![word],
+            })
+            .await?;
+            alone.remember(*address, held, word, Instant::now());
             Ok(Answer::Done)
         }
         Request::ReadWrite {
@@ -366,6 +405,7 @@ async fn answered(registers: &dyn Registers, client: &Client, request: &Request)
             registers.words(Table::Holding, *read_start, *read_count)?;
             let start = *write_start;
             let words = words.clone();
+            let _shared = masks.beside(start, words.len()).await;
             write(Write::Registers { start, words }).await?;
             registers
                 .words(Table::Holding, *read_start, *read_count)

@@ -210,5 +210,6 @@ fn master_view(modbus: &ModbusDriver) -> Option<MasterView> {
     Some(MasterView {
         with: plan.with.clone(),
         epoch: epoch.filter(|_| modbus.may_write()),
+        ready: modbus.reaches_the_lease(),
     })
 }

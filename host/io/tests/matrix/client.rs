@@ -10,7 +10,8 @@ use bumpless_io::{Clock, Config, IoServer, PointIndex, WriteStamp};
 
 use crate::{
     Row, Verdict,
-    tools::{Process, Tool},
+    relay::{Relay, Spoil},
+    tools::{Process, Tool, certificates},
 };
 
 /// How long something may take that must come.
@@ -91,6 +92,11 @@ impl Ours {
 
     /// Writes, and waits until polls of later than the write have seen all of it.
     fn write(&self, values: &[(String, f64)]) -> Verdict {
+        self.write_unless(values, || false).expect("nothing ends it")
+    }
+
+    /// As [`Ours::write`]; none where `over` comes first.
+    fn write_unless(&self, values: &[(String, f64)], over: impl Fn() -> bool) -> Option<Verdict> {
         let stamp = WriteStamp {
             loop_id: LoopId::new("x").unwrap(),
             term: 1,
@@ -106,17 +112,20 @@ impl Ours {
             list.iter()
                 .all(|(index, value)| self.server.read_one(*index, self.server.clock().now_ns()).value == Ok(*value))
         };
-        let taken = self.until("the device's confirmation", held);
+        let taken = self.until("the device's confirmation", || over() || held());
+        if over() {
+            return None;
+        }
         if taken != Verdict::Good {
-            return taken;
+            return Some(taken);
         }
         let after_ns = self.server.clock().now_ns();
-        self.until("what was written", || {
+        Some(self.until("what was written", || {
             list.iter().all(|(index, value)| {
                 let reading = self.server.read_one(*index, self.server.clock().now_ns());
                 reading.at_ns > after_ns && reading.value == Ok(*value)
             })
-        })
+        }))
     }
 }
 
@@ -124,44 +133,154 @@ fn named(pairs: &[(&str, f64)]) -> Vec<(String, f64)> {
     pairs.iter().map(|(name, value)| ((*name).to_owned(), *value)).collect()
 }
 
+/// Good where the function went out and was answered well since; missing where the peer refused it each time.
+fn by(relay: &Relay, function: u8, before: (u32, u32), verdict: Verdict) -> Verdict {
+    if verdict != Verdict::Good {
+        return verdict;
+    }
+    let (well, refused) = relay.seen(function);
+    if well > before.0 {
+        Verdict::Good
+    } else if refused > before.1 {
+        Verdict::Missing
+    } else {
+        Verdict::Bad(format!("the values came, but not by function {function}"))
+    }
+}
+
 /// Our client against a peer's server.
 pub(crate) fn against(tool: &Tool) -> Row {
     let mut row = Row::new(format!("ours → {}", tool.name));
     let (_process, port) = Process::server(tool);
+    let relay = Relay::start(port);
     for mode in ["auto", "multiple", "single"] {
-        let ours = Ours::open(port, &format!("write_with = \"{mode}\""));
-        for (column, point) in [("1", "c0"), ("2", "discrete"), ("3", "h124"), ("4", "input")] {
+        let ours = Ours::open(relay.port, &format!("write_with = \"{mode}\""));
+        for (column, point, function) in [
+            ("1", "c0", 1),
+            ("2", "discrete", 2),
+            ("3", "h124", 3),
+            ("4", "input", 4),
+        ] {
+            // Polled since it was opened, so any answer of the function is this one's.
             let came = ours.until(point, || ours.value(point).is_ok());
-            row.add(column, came);
+            row.add(column, by(&relay, function, (0, 0), came));
         }
         let beyond = ours.until("exception 2", || ours.value("beyond") == Err(NoData::DeviceError(2)));
         row.add("exceptions", beyond);
+        let mut write = |column: &str, function: u8, values: &[(String, f64)]| {
+            let before = relay.seen(function);
+            let verdict = ours.write(values);
+            row.add(column, by(&relay, function, before, verdict));
+        };
         // Another value in each mode, so that each really writes.
         let v = mode.len() as f64;
         let (bit, register) = if mode == "multiple" { ("15", "16") } else { ("5", "6") };
-        row.add(bit, ours.write(&named(&[("c7", 1.0)])));
-        row.add(bit, ours.write(&named(&[("c7", 0.0)])));
-        row.add(register, ours.write(&named(&[("h10", 40_000.0 + v)])));
-        row.add("16", ours.write(&named(&[("f32", -2.5 - v), ("i32", -70_000.0 - v)])));
-        row.add("22", ours.write(&named(&[("bit", 1.0), ("field", v)])));
-        row.add("22", ours.write(&named(&[("bit", 0.0)])));
+        let number = |column: &str| column.parse().expect("a function");
+        write(bit, number(bit), &named(&[("c7", 1.0)]));
+        write(bit, number(bit), &named(&[("c7", 0.0)]));
+        write(register, number(register), &named(&[("h10", 40_000.0 + v)]));
+        write("16", 16, &named(&[("f32", -2.5 - v), ("i32", -70_000.0 - v)]));
+        // A unit without function 22 is asked once; then its registers are written whole.
+        write("22", 22, &named(&[("bit", 1.0), ("field", v)]));
         if mode != "single" {
             let registers: Vec<_> = (0..125).map(|n| (format!("h{n}"), 100.0 * v + f64::from(n))).collect();
-            row.add("limits", ours.write(&registers));
+            write("limits", 16, &registers);
             let coils: Vec<_> = (0..2000)
                 .map(|n| (format!("c{n}"), f64::from(u8::from((n + mode.len()) % 3 == 0))))
                 .collect();
-            row.add("limits", ours.write(&coils));
-            row.add("15", ours.write(&named(&[("c1", 1.0), ("c2", 1.0), ("c3", 0.0)])));
+            write("limits", 15, &coils);
+            write("15", 15, &named(&[("c1", 1.0), ("c2", 1.0), ("c3", 0.0)]));
         }
     }
-    let ours = Ours::open(port, "write_with = \"read-write\"");
-    ours.until("h0", || ours.value("h0").is_ok());
-    // Node's server has no function 23; the client says so in words.
-    if tool.name == "modbus-serial" {
-        row.add("23", Verdict::Missing);
-    } else {
-        row.add("23", ours.write(&named(&[("h20", 7.0), ("h21", 8.0), ("f32", 99.5)])));
+    {
+        let ours = Ours::open(relay.port, "write_with = \"read-write\"");
+        ours.until("h0", || ours.value("h0").is_ok());
+        let before = relay.seen(23);
+        // Where the server has no function 23, nothing comes of it, and the client says so in words.
+        let refused = || relay.seen(23).1 > before.1;
+        let values = named(&[("h20", 7.0), ("h21", 8.0), ("f32", 99.5)]);
+        let verdict = ours.write_unless(&values, refused).unwrap_or(Verdict::Good);
+        row.add("23", by(&relay, 23, before, verdict));
     }
+    row.add("malformed", spoiled(&relay));
+    row.add("unit", stranger(relay.port));
+    row
+}
+
+/// Spoils answers in each way, until it shows; then all must be well again by itself.
+fn spoiled(relay: &Relay) -> Verdict {
+    let ours = Ours::open(relay.port, "backoff_ms_min = 10\nbackoff_ms_max = 50");
+    let well = |what: &str| {
+        let after_ns = ours.server.clock().now_ns();
+        ours.until(what, || {
+            let reading = ours.server.read_one(ours.index("h0"), ours.server.clock().now_ns());
+            reading.value.is_ok() && reading.at_ns > after_ns
+        })
+    };
+    let mut verdict = well("a value");
+    for spoil in [Spoil::Pieces, Spoil::Number, Spoil::Half, Spoil::Nonsense] {
+        if verdict != Verdict::Good {
+            break;
+        }
+        let before = relay.spoiled();
+        relay.spoil(spoil);
+        verdict = ours.until("a spoiled answer", || relay.spoiled() > before + 2);
+        if spoil == Spoil::Pieces && verdict == Verdict::Good {
+            verdict = well("a value in pieces");
+        } else if verdict == Verdict::Good {
+            verdict = ours.until("the loss", || ours.value("h0") == Err(NoData::CommsLost));
+        }
+        relay.spoil(Spoil::Nothing);
+        if verdict == Verdict::Good {
+            verdict = well(&format!("a value after {spoil:?}"));
+        }
+    }
+    verdict
+}
+
+/// A unit that the peer does not have, beside one that it has: its point is bad with a reason, and the other is well.
+fn stranger(port: u16) -> Verdict {
+    let away =
+        "[[bus.point]]\nid = \"away\"\ntable = \"holding\"\naddress = 0\nunit_id = 9\nlow = 0.0\nhigh = 65535.0\n";
+    let ours = Ours::open(port, away);
+    let came = ours.until("h0", || ours.value("h0").is_ok());
+    if came != Verdict::Good {
+        return came;
+    }
+    let mut said = Err(NoData::NeverRead);
+    let ended = ours.until("the other unit's end", || {
+        said = ours.value("away");
+        !matches!(said, Err(NoData::NeverRead))
+    });
+    match (ended, said) {
+        (Verdict::Good, Err(NoData::CommsLost | NoData::DeviceError(10 | 11))) => {
+            let after_ns = ours.server.clock().now_ns();
+            ours.until("the unit beside it", || {
+                let reading = ours.server.read_one(ours.index("h0"), ours.server.clock().now_ns());
+                reading.value.is_ok() && reading.at_ns > after_ns
+            })
+        }
+        (Verdict::Good, Ok(_)) => Verdict::Missing,
+        (Verdict::Good, Err(other)) => Verdict::Bad(format!("unit 9: {other}")),
+        (bad, _) => bad,
+    }
+}
+
+/// Our client against a peer's server, over TLS.
+pub(crate) fn against_over_tls(tool: &Tool) -> Row {
+    let mut row = Row::new(format!("ours → {}, TLS", tool.name));
+    let (_process, port) = Process::server_over_tls(tool);
+    let folder = certificates();
+    let tls = format!(
+        "[bus.tls]\nca = \"{folder}/plant.pem\"\ncertificate = \"{folder}/host.pem\"\nkey = \"{folder}/host.key\"\n"
+    );
+    let ours = Ours::open(port, &tls);
+    row.add("3", ours.until("h124", || ours.value("h124").is_ok()));
+    row.add(
+        "exceptions",
+        ours.until("exception 2", || ours.value("beyond") == Err(NoData::DeviceError(2))),
+    );
+    row.add("6", ours.write(&named(&[("h10", 4_711.0)])));
+    row.add("16", ours.write(&named(&[("f32", -2.5), ("i32", -70_000.0)])));
     row
 }

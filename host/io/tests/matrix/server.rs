@@ -3,12 +3,13 @@
 use std::{
     io::{Read as _, Write as _},
     net::{SocketAddr, TcpStream},
+    path::PathBuf,
     sync::{Arc, Mutex},
     time::Duration,
 };
 
 use bumpless_io::modbus::{
-    Exception, Table,
+    Exception, ServerTls, Table,
     server::{Client, Identity, Registers, ServerCounts, ServerOptions, Write, Writing, serve},
 };
 use serde_json::{Value, json};
@@ -16,7 +17,7 @@ use tokio::sync::watch;
 
 use crate::{
     Row, Verdict,
-    tools::{Process, Tool, mbpoll},
+    tools::{Process, Tool, certificates, mbpoll, mbpoll_unit},
 };
 
 /// From here on, the address tells the exception that a read of it gets.
@@ -29,11 +30,14 @@ struct Memory {
     bits: Mutex<[Vec<bool>; 2]>,
     words: Mutex<[Vec<u16>; 2]>,
     identity: Identity,
+    /// Only clients with the role of an operator write.
+    by_role: bool,
 }
 
 impl Memory {
-    fn new() -> Self {
+    fn new(by_role: bool) -> Self {
         Self {
+            by_role,
             bits: Mutex::new([
                 (0..3000).map(|n| n % 3 == 0).collect(),
                 (0..3000).map(|n| n % 2 == 0).collect(),
@@ -75,7 +79,10 @@ impl Registers for Memory {
         )
     }
 
-    fn write(&self, _: &Client, write: Write) -> Writing {
+    fn write(&self, client: &Client, write: Write) -> Writing {
+        if self.by_role && client.role.as_deref() != Some("operator") {
+            return Box::pin(std::future::ready(Err(Exception::FUNCTION)));
+        }
         let end = match write {
             Write::Coils { start, bits } => {
                 let at = usize::from(start);
@@ -108,7 +115,9 @@ struct Served {
 }
 
 impl Served {
-    fn start() -> Self {
+    fn start(tls: Option<ServerTls>) -> Self {
+        let secured = tls.is_some();
+        let tls = tls.map(|tls| tls.open("the matrix").unwrap());
         let runtime = tokio::runtime::Builder::new_multi_thread()
             .worker_threads(1)
             .enable_all()
@@ -121,12 +130,12 @@ impl Served {
             name: "matrix".to_owned(),
             connections_max: 8,
             idle: Duration::from_secs(60),
-            tls: None,
+            tls,
         };
         runtime.spawn(serve(
             listener,
             options,
-            Arc::new(Memory::new()),
+            Arc::new(Memory::new(secured)),
             Arc::new(ServerCounts::default()),
             stopping,
         ));
@@ -299,11 +308,58 @@ fn nonsense(address: SocketAddr) {
     }
 }
 
-/// A peer's client against our server.
-pub(crate) fn against(tool: &Tool) -> Row {
-    let served = Served::start();
-    let mut row = Row::new(format!("{} → ours", tool.name));
-    let mut client = Process::client(tool, served.address.port(), 1);
+/// Requests one beyond each limit, and what a peer's client may call them.
+fn over() -> Vec<(Value, Vec<u8>)> {
+    let read = |function: u8, count: u16| {
+        let [high, low] = count.to_be_bytes();
+        vec![function, 0, 0, high, low]
+    };
+    let words: Vec<u16> = vec![1; 124];
+    let bits: Vec<u16> = vec![1; 1969];
+    // The bytes of 124 registers do not fit in a request, so they say that they are 248, and fewer come; those of 1,969 coils fit.
+    let sixteen = [vec![16, 0, 0, 0, 124, 248], vec![0; 246]].concat();
+    let fifteen = [vec![15, 0, 0, 0x07, 0xB1, 247], vec![0; 247]].concat();
+    let both = [vec![23, 0, 0, 0, 126, 0, 0, 0, 1, 2], vec![0; 2]].concat();
+    vec![
+        (json!(["read", "coil", 0, 2001]), read(1, 2001)),
+        (json!(["read", "discrete", 0, 2001]), read(2, 2001)),
+        (json!(["read", "holding", 0, 126]), read(3, 126)),
+        (json!(["read", "input", 0, 126]), read(4, 126)),
+        (json!(["write-registers", 0, words]), sixteen),
+        (json!(["write-coils", 0, bits]), fifteen),
+        (json!(["read-write", 0, 126, 0, [7]]), both),
+    ]
+}
+
+/// The answer to one request's bytes, on a connection of its own.
+fn raw(address: SocketAddr, pdu: &[u8]) -> std::io::Result<Vec<u8>> {
+    let mut stream = TcpStream::connect(address)?;
+    stream.set_read_timeout(Some(Duration::from_secs(5)))?;
+    let [high, low] = (pdu.len() as u16 + 1).to_be_bytes();
+    stream.write_all(&[&[0, 9, 0, 0, high, low, 1], pdu].concat())?;
+    let mut answer = [0; 9];
+    stream.read_exact(&mut answer)?;
+    Ok(answer[7..].to_vec())
+}
+
+/// Beyond the limits: exception 3, from the peer's client where it sends such a thing, and from the bare bytes.
+fn over_the_limits(client: &mut Process, address: SocketAddr) -> Verdict {
+    for (operation, pdu) in over() {
+        let told = client.ask(&operation);
+        // Most clients count for themselves, and say so in their own words.
+        if told.get("error").is_none() && told != json!({ "exception": 3 }) {
+            let short: String = operation.to_string().chars().take(60).collect();
+            return Verdict::Bad(format!("{short}: {told} instead of exception 3"));
+        }
+        match raw(address, &pdu) {
+            Ok(answer) if answer == [pdu[0] | 0x80, 3] => {}
+            other => return Verdict::Bad(format!("function {} over its limit: {other:?}", pdu[0])),
+        }
+    }
+    Verdict::Good
+}
+
+fn asked(row: &mut Row, client: &mut Process) {
     for (column, operation, wanted) in operations() {
         let got = client.ask(&operation);
         let verdict = match judged(&got, &wanted) {
@@ -312,7 +368,19 @@ pub(crate) fn against(tool: &Tool) -> Row {
         };
         row.add(column, verdict);
     }
+}
+
+/// A peer's client against our server.
+pub(crate) fn against(tool: &Tool) -> Row {
+    let served = Served::start(None);
+    let mut row = Row::new(format!("{} → ours", tool.name));
+    let mut client = Process::client(tool, served.address.port(), 1);
+    asked(&mut row, &mut client);
+    let over = over_the_limits(&mut client, served.address);
+    row.add("over", over);
     nonsense(served.address);
+    // One that had to be told of its own mistakes may have closed its connection over them.
+    let mut client = Process::client(tool, served.address.port(), 1);
     let got = client.ask(&json!(["read", "holding", 5, 1]));
     row.add("malformed", judged(&got, &json!({ "values": [5] })));
     let mut away = Process::client(tool, served.address.port(), AWAY);
@@ -321,9 +389,40 @@ pub(crate) fn against(tool: &Tool) -> Row {
     row
 }
 
+/// A peer's client against our server, over TLS: with a role that may write, and with none.
+pub(crate) fn against_over_tls(tool: &Tool) -> Row {
+    let folder = PathBuf::from(certificates());
+    let served = Served::start(Some(ServerTls {
+        certificate: folder.join("device.pem"),
+        key: folder.join("device.key"),
+        client_ca: folder.join("plant.pem"),
+    }));
+    let mut row = Row::new(format!("{}, TLS → ours", tool.name));
+    let port = served.address.port();
+    asked(&mut row, &mut Process::client_over_tls(tool, port, 1, "operator"));
+    let mut viewer = Process::client_over_tls(tool, port, 1, "viewer");
+    let got = viewer.ask(&json!(["read", "holding", 5, 1]));
+    row.add("3", judged(&got, &json!({ "values": [5] })));
+    for write in [
+        json!(["write-register", 5, 1]),
+        json!(["write-coils", 5, [1, 1]]),
+        json!(["mask", 5, 0, 1]),
+        json!(["read-write", 5, 1, 5, [9]]),
+    ] {
+        let got = viewer.ask(&write);
+        row.add("exceptions", judged(&got, &json!({ "exception": 1 })));
+    }
+    let got = viewer.ask(&json!(["read", "holding", 5, 1]));
+    row.add("exceptions", judged(&got, &json!({ "values": [5] })));
+    let mut away = Process::client_over_tls(tool, port, AWAY, "operator");
+    let got = away.ask(&json!(["read", "holding", 5, 1]));
+    row.add("unit", judged(&got, &json!({ "exception": 11 })));
+    row
+}
+
 /// The usual command of engineers against our server.
 pub(crate) fn against_mbpoll() -> Row {
-    let served = Served::start();
+    let served = Served::start(None);
     let port = served.address.port();
     let mut row = Row::new("mbpoll → ours".to_owned());
     let mut check = |column: &str, got: Result<Vec<i64>, String>, wanted: &[i64]| {
@@ -338,8 +437,12 @@ pub(crate) fn against_mbpoll() -> Row {
     check("2", mbpoll(port, "1", 3, 3, &[]), &[0, 1, 0]);
     check("3", mbpoll(port, "4", 5, 3, &[]), &[5, 6, 7]);
     check("4", mbpoll(port, "3", 7, 2, &[]), &[1007, 1008]);
+    check("5", mbpoll(port, "0", 1, 1, &["1"]), &[]);
+    check("5", mbpoll(port, "0", 1, 1, &[]), &[1]);
     check("6", mbpoll(port, "4", 100, 1, &["4711"]), &[]);
     check("6", mbpoll(port, "4", 100, 1, &[]), &[4711]);
+    check("15", mbpoll(port, "0", 10, 3, &["1", "1", "0"]), &[]);
+    check("15", mbpoll(port, "0", 9, 5, &[]), &[1, 1, 1, 0, 0]);
     check("16", mbpoll(port, "4", 110, 3, &["1", "2", "3"]), &[]);
     check("16", mbpoll(port, "4", 109, 5, &[]), &[109, 1, 2, 3, 113]);
     check(
@@ -347,15 +450,24 @@ pub(crate) fn against_mbpoll() -> Row {
         mbpoll(port, "3", 0, 125, &[]),
         &(1000..1125).collect::<Vec<_>>(),
     );
-    let refused = mbpoll(port, "4", 2999, 2, &[]);
-    let named = matches!(&refused, Err(text) if text.contains("Illegal data address"));
-    row.add(
-        "exceptions",
-        if named {
-            Verdict::Good
-        } else {
-            Verdict::Bad(format!("{refused:?}"))
-        },
+    nonsense(served.address);
+    check("malformed", mbpoll(port, "4", 5, 1, &[]), &[5]);
+    let mut refused = |column: &str, got: Result<Vec<i64>, String>, words: &str| {
+        let named = matches!(&got, Err(text) if text.contains(words));
+        row.add(
+            column,
+            if named {
+                Verdict::Good
+            } else {
+                Verdict::Bad(format!("{got:?}"))
+            },
+        );
+    };
+    refused("exceptions", mbpoll(port, "4", 2999, 2, &[]), "Illegal data address");
+    refused(
+        "unit",
+        mbpoll_unit(port, AWAY, "4", 5, 1, &[]),
+        "Target device failed to respond",
     );
     row
 }

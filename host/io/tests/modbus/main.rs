@@ -9,6 +9,7 @@
 )]
 
 mod errands;
+mod losses;
 mod peer;
 mod scan;
 mod transports;

@@ -26,6 +26,8 @@ pub(crate) enum Manner {
     WriteException(u8),
     /// Exception 2 to reads of more than two addresses: gaps do not exist here.
     RefusesGaps,
+    /// Exception 2 to reads of this address and its neighbours with it.
+    Without(u16),
     /// Not at all.
     Silent,
     /// Not for this unit.
@@ -51,6 +53,8 @@ pub(crate) struct Device {
     pub(crate) manner: Manner,
     pub(crate) words: [u16; 1000],
     pub(crate) bits: [bool; 1000],
+    /// Requests that came.
+    pub(crate) asked: u64,
 }
 
 /// A request as it came: unit and function with data.
@@ -103,6 +107,7 @@ impl Peer {
             manner: Manner::Good,
             words: [0; 1000],
             bits: [false; 1000],
+            asked: 0,
         }));
         let ending = Arc::new(AtomicBool::new(false));
         let (sender, writes) = mpsc::channel();
@@ -184,6 +189,7 @@ fn serve(mut stream: TcpStream, device: &Mutex<Device>, ending: &AtomicBool, wri
             let (unit, pdu) = (frame[6], &frame[7..]);
             let mut device = device.lock().expect("device");
             let manner = device.manner;
+            device.asked += 1;
             let is_write = matches!(pdu[0], 5 | 6 | 15 | 16 | 22 | 23);
             let mut answer = match manner {
                 Manner::Silent => continue,
@@ -194,6 +200,7 @@ fn serve(mut stream: TcpStream, device: &Mutex<Device>, ending: &AtomicBool, wri
                 Manner::WithoutMask if pdu[0] == 22 => vec![pdu[0] | 0x80, 1],
                 Manner::Forgets if matches!(pdu[0], 5 | 6 | 15 | 16) => pdu[..5].to_vec(),
                 Manner::RefusesGaps if !is_write && u16::from_be_bytes([pdu[3], pdu[4]]) > 2 => vec![pdu[0] | 0x80, 2],
+                Manner::Without(address) if !is_write && reads(pdu, address) => vec![pdu[0] | 0x80, 2],
                 _ => answered(&mut device, pdu),
             };
             drop(device);
@@ -226,6 +233,15 @@ fn serve(mut stream: TcpStream, device: &Mutex<Device>, ending: &AtomicBool, wri
             }
         }
     }
+}
+
+/// Does a read ask for this address?
+fn reads(pdu: &[u8], address: u16) -> bool {
+    let (start, count) = (
+        u16::from_be_bytes([pdu[1], pdu[2]]),
+        u16::from_be_bytes([pdu[3], pdu[4]]),
+    );
+    (start..start + count).contains(&address)
 }
 
 /// The answer of a device in order. Coils and discrete inputs share their bits, both kinds of registers their words.

@@ -45,8 +45,18 @@ impl Registers for Counting {
     fn words(&self, _: Table, start: u16, count: u16) -> Result<Vec<u16>, Exception> {
         Ok((start..).take(usize::from(count)).collect())
     }
-    fn write(&self, _: &Client, _: Write) -> Writing {
-        Box::pin(std::future::ready(Ok(())))
+    fn write(&self, client: &Client, _: Write) -> Writing {
+        let end = match client.role.as_deref() {
+            Some("operator") => Ok(()),
+            _ => Err(Exception::FUNCTION),
+        };
+        Box::pin(std::future::ready(end))
+    }
+    fn admits(&self, client: &Client) -> Result<(), Exception> {
+        match client.role.as_deref() {
+            Some("stranger") => Err(Exception::FUNCTION),
+            _ => Ok(()),
+        }
     }
     fn identity(&self) -> &Identity {
         &self.0
@@ -155,6 +165,38 @@ fn tls_both_ways_lets_in_who_shows_a_certificate() {
     }
     assert!(server.counts.malformed.load(Ordering::Relaxed) >= 3);
     assert_eq!(read(&good), Ok(42.0), "the others were not disturbed");
+}
+
+#[test]
+fn the_role_in_a_certificate_says_who_may_write() {
+    let server = secured();
+    for (name, said) in [
+        ("operator", None),
+        ("viewer", Some("exception 1, illegal function")),
+        ("host", Some("exception 1, illegal function")),
+    ] {
+        let text = over_tls(server.address, &keys("plant.pem", name)) + &point("b", "holding", 7, HUNDRED);
+        let ours = open(&server.runtime, &text);
+        eventually(
+            || (read(&ours) == Ok(42.0)).then_some(()),
+            || format!("{name}: {:?}", ours.status()),
+        );
+        crate::write(&ours, &[("b", 33.0)]).unwrap();
+        let ended = eventually(
+            || {
+                let status = ours.status().remove(0);
+                (status.writes == 1 || status.last_error.is_some()).then_some(status)
+            },
+            || format!("{name}: {:?}", ours.status()),
+        );
+        match said {
+            None => assert_eq!((ended.writes, ended.last_error), (1, None), "{name}"),
+            Some(part) => {
+                let error = ended.last_error.unwrap_or_default();
+                assert!(error.contains(part) && ended.writes == 0, "{name}: {error}");
+            }
+        }
+    }
 }
 
 #[test]

@@ -11,7 +11,7 @@
 use std::sync::Arc;
 
 use bumpless_core::{Digest, HostId, LoopId, NoData, PointId, Record};
-use bumpless_io::modbus::server::answer;
+use bumpless_io::modbus::server::{Masks, answer};
 use parking_lot::Mutex;
 
 use super::*;
@@ -179,8 +179,10 @@ impl Bench {
     fn ask(&self, pdu: &[u8]) -> Vec<u8> {
         let client = Client {
             address: ([192, 0, 2, 9], 4711).into(),
+            role: None,
         };
-        self.runtime.block_on(answer(&self.face, &client, 1, pdu))
+        self.runtime
+            .block_on(answer(&self.face, &Masks::default(), &client, 1, pdu))
     }
 }
 

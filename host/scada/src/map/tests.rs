@@ -183,7 +183,7 @@ fn writes_are_whole_permitted_and_in_range_or_refused_with_a_reason() {
         bits: bits.to_vec(),
     };
     let good = |write: &Write| -> Vec<(String, f64)> {
-        let wishes = map.wishes(write).unwrap();
+        let wishes = map.wishes(write, None).unwrap();
         wishes.iter().map(|wish| (wish.entry.name(), wish.value)).collect()
     };
     assert_eq!(
@@ -214,13 +214,89 @@ fn writes_are_whole_permitted_and_in_range_or_refused_with_a_reason() {
         ),
         (coils(4, &[true, true]), Exception::ADDRESS, "coil 5 is not mapped"),
     ] {
-        let refusal = map.wishes(&write).expect_err(part);
+        let refusal = map.wishes(&write, None).expect_err(part);
         assert_eq!(refusal.exception, exception, "{part}: {refusal:?}");
         assert!(refusal.reason.contains(part), "{part}: {refusal:?}");
     }
     let silent = Map::new(&config(&entry("holding", 0, "point = \"a\""))).unwrap();
     assert_eq!(
-        silent.wishes(&registers(0, &[1])).unwrap_err().exception,
+        silent.wishes(&registers(0, &[1]), None).unwrap_err().exception,
         Exception::FUNCTION
     );
+}
+
+const TLS: &str = "[tls]\ncertificate = \"a\"\nkey = \"b\"\nclient_ca = \"c\"\n";
+
+#[test]
+fn roles_say_who_asks_and_who_writes() {
+    let registers = |start: u16, words: &[u16]| Write::Registers {
+        start,
+        words: words.to_vec(),
+    };
+    let text = format!(
+        "read_roles = [\"viewer\", \"operator\", \"engineer\"]\nwrite_roles = [\"operator\", \"engineer\"]\n{TLS}{}{}{}",
+        entry("holding", 0, "point = \"a\"\nwritable = true"),
+        entry(
+            "holding",
+            1,
+            "point = \"b\"\nwritable = true\nwrite_roles = [\"engineer\"]"
+        ),
+        entry("coil", 0, "point = \"c\"\nwritable = true\nwrite_roles = []"),
+    );
+    let map = Map::new(&config(&text)).unwrap();
+    for (role, admitted) in [
+        (None, false),
+        (Some("guest"), false),
+        (Some("viewer"), true),
+        (Some("operator"), true),
+    ] {
+        assert_eq!(map.admits(role), admitted, "{role:?}");
+    }
+    let coil = Write::Coils {
+        start: 0,
+        bits: vec![true],
+    };
+    for (write, role, allowed) in [
+        (registers(0, &[1]), None, false),
+        (registers(0, &[1]), Some("viewer"), false),
+        (registers(0, &[1]), Some("operator"), true),
+        (registers(1, &[1]), Some("operator"), false),
+        (registers(1, &[1]), Some("engineer"), true),
+        // One address that it may not write, and nothing of it is written.
+        (registers(0, &[1, 2]), Some("operator"), false),
+        (registers(0, &[1, 2]), Some("engineer"), true),
+        (coil, None, true),
+    ] {
+        match map.wishes(&write, role) {
+            Ok(_) => assert!(allowed, "{write:?} by {role:?}"),
+            Err(refusal) => {
+                assert!(!allowed, "{write:?} by {role:?}: {refusal:?}");
+                assert_eq!(refusal.exception, Exception::FUNCTION, "{refusal:?}");
+                assert!(refusal.reason.contains("may be written by"), "{refusal:?}");
+            }
+        }
+    }
+    let plain = entry("holding", 0, "point = \"a\"\nwritable = true");
+    let many: Vec<String> = (0..17).map(|n| format!("r{n}")).collect();
+    for (text, part) in [
+        (
+            format!("write_roles = [\"operator\"]\n{plain}"),
+            "add [modbus_server.tls]",
+        ),
+        (
+            format!("read_roles = [\"\"]\n{TLS}{plain}"),
+            "each of 1 to 64 characters",
+        ),
+        (format!("read_roles = {many:?}\n{TLS}{plain}"), "at most 16"),
+        (
+            format!(
+                "{TLS}{}",
+                entry("holding", 0, "point = \"a\"\nwrite_roles = [\"operator\"]")
+            ),
+            "write_roles are for what may be written",
+        ),
+    ] {
+        let error = Map::new(&config(&text)).expect_err(part).to_string();
+        assert!(error.contains(part), "{part}: {error}");
+    }
 }

@@ -9,7 +9,7 @@ use bumpless_io::{JobStep, job, modbus::Table};
 
 use super::{
     JobDraft, JobState, JobTask, JobView,
-    queue::{Job, Work},
+    queue::{Job, Taken, Work},
 };
 use crate::{
     commissioning::{BusView, FieldAsk, FieldEvent, FieldTold, forces, points::unexpected},
@@ -37,29 +37,33 @@ impl Room {
                 self.not_in_a_loops_way(&draft.bus, step, *unit_id)?;
             }
         }
-        let (job, new) = self.commissioning.jobs.take(&self.here, draft, work, time)?;
-        if new {
-            let idle = self.commissioning.jobs.enqueue(&job);
+        let (job, taken) = self.commissioning.jobs.take(&self.here, draft, work, time)?;
+        if taken != Taken::Known {
             tracing::info!(job = %job.view.lock().id, bus = job.draft.bus, task = job.draft.task.name(), by = job.draft.by, "a job was taken in");
             self.tell_job(&job);
-            if idle {
+            if taken == Taken::Idle {
                 self.work_off(job.draft.bus.clone());
             }
-            self.expire_queued(Arc::clone(&job));
         }
         Ok(self.shown(&job))
     }
 
-    /// Ends a job that nobody worked on in time.
-    fn expire_queued(self: &Arc<Self>, job: Arc<Job>) {
-        let room = Arc::clone(self);
-        self.spawn(async move {
-            tokio::time::sleep_until(job.queue_until).await;
-            let reason = "its turn did not come in time; nothing was sent";
-            if room.commissioning.jobs.drop_queued(&job, JobState::Expired, reason) {
+    /// Ends jobs that nobody worked on in time, for as long as the host lives. One sleeper for all of them.
+    pub(crate) async fn watch_queues(room: Arc<Self>) {
+        let jobs = &room.commissioning.jobs;
+        loop {
+            let next = jobs.next_over();
+            tokio::select! {
+                () = jobs.waits.notified() => {}
+                () = async { match next {
+                    Some(at) => tokio::time::sleep_until(at).await,
+                    None => std::future::pending().await,
+                } } => {}
+            }
+            for job in jobs.take_over(tokio::time::Instant::now()) {
                 room.tell_job(&job);
             }
-        });
+        }
     }
 
     fn shown(&self, job: &Job) -> JobView {
@@ -185,7 +189,7 @@ impl Room {
             None => {
                 let buses = self.buses().await?;
                 // Of a device with two masters, the one that is.
-                let stands_by = |bus: &&BusView| matches!(bus.master, Some((_, None)));
+                let stands_by = |bus: &&BusView| bus.master.as_ref().is_some_and(|part| part.epoch.is_none());
                 let mut hosts = buses
                     .iter()
                     .filter(|bus| bus.id == draft.bus && !stands_by(bus))

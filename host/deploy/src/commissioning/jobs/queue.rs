@@ -11,7 +11,10 @@ use std::{
 use bumpless_core::HostId;
 use bumpless_io::{Clock, JobStep, scan::ScanPlan};
 use parking_lot::Mutex;
-use tokio::{sync::watch, time::Instant};
+use tokio::{
+    sync::{Notify, watch},
+    time::Instant,
+};
 
 use super::{JobDraft, JobState, JobView};
 use crate::{
@@ -39,6 +42,17 @@ pub(super) struct Job {
     pub(super) cancelled: watch::Sender<Option<String>>,
 }
 
+/// How a job was taken in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Taken {
+    /// It was there already.
+    Known,
+    /// It waits, and the bus has a task that works its queue off.
+    Queued,
+    /// It waits, and the bus needs such a task.
+    Idle,
+}
+
 #[derive(Debug, Default)]
 pub(super) struct Inside {
     taken: u64,
@@ -55,6 +69,8 @@ pub(crate) struct Jobs {
     start: u64,
     clock: Clock,
     pub(super) inside: Mutex<Inside>,
+    /// Wakes whoever looks after those that wait too long.
+    pub(super) waits: Notify,
 }
 
 impl Jobs {
@@ -63,6 +79,7 @@ impl Jobs {
             start,
             clock,
             inside: Mutex::default(),
+            waits: Notify::new(),
         }
     }
 
@@ -83,20 +100,21 @@ impl Jobs {
         self.inside.lock().jobs.get(&number).cloned()
     }
 
-    /// Takes a job in, or finds the one that was taken in for the same key. True where it is new.
+    /// Puts a job into its bus's queue, or finds the one that was taken in for the same key. One lock from the look at the
+    /// bound to the place in the queue: many clients at once do not pass it together.
     pub(super) fn take(
         &self,
         here: &HostId,
         draft: JobDraft,
         work: Work,
         time: Duration,
-    ) -> Result<(Arc<Job>, bool), Error> {
+    ) -> Result<(Arc<Job>, Taken), Error> {
         let mut inside = self.inside.lock();
         if let Some(key) = &draft.key
             && let Some(known) = inside.jobs.values().find(|job| job.draft.key.as_ref() == Some(key))
         {
             if known.draft.bus == draft.bus && known.draft.task == draft.task {
-                return Ok((Arc::clone(known), false));
+                return Ok((Arc::clone(known), Taken::Known));
             }
             return Err(Error::refused(
                 format!("the key {key:?} was given to another job, {}", known.view.lock().id),
@@ -164,19 +182,39 @@ impl Jobs {
                 None => break,
             };
         }
-        Ok((job, true))
-    }
-
-    /// Puts a job into its bus's queue. True where the bus has no task that works it off.
-    pub(super) fn enqueue(&self, job: &Job) -> bool {
-        let mut inside = self.inside.lock();
         let idle = !inside.queues.contains_key(&job.draft.bus);
         inside
             .queues
             .entry(job.draft.bus.clone())
             .or_default()
-            .push_back(job.number);
-        idle
+            .push_back(number);
+        drop(inside);
+        self.waits.notify_one();
+        Ok((job, if idle { Taken::Idle } else { Taken::Queued }))
+    }
+
+    /// When the next of those that wait will have waited too long; none where none waits.
+    pub(super) fn next_over(&self) -> Option<Instant> {
+        let inside = self.inside.lock();
+        let waiting = inside.queues.values().flatten();
+        waiting
+            .filter_map(|number| inside.jobs.get(number).map(|job| job.queue_until))
+            .min()
+    }
+
+    /// Takes those out that have waited too long.
+    pub(super) fn take_over(&self, now: Instant) -> Vec<Arc<Job>> {
+        let late: Vec<Arc<Job>> = {
+            let inside = self.inside.lock();
+            let waiting = inside.queues.values().flatten();
+            waiting
+                .filter_map(|number| inside.jobs.get(number).filter(|job| job.queue_until <= now).cloned())
+                .collect()
+        };
+        let reason = "its turn did not come in time; nothing was sent";
+        late.into_iter()
+            .filter(|job| self.drop_queued(job, JobState::Expired, reason))
+            .collect()
     }
 
     /// The next job of a bus, which runs from now on; none where the queue is empty: its task ends then.
@@ -259,27 +297,70 @@ mod tests {
         }
     }
 
-    fn take(jobs: &Jobs, draft: JobDraft) -> Result<(Arc<Job>, bool), Error> {
+    fn take(jobs: &Jobs, draft: JobDraft) -> Result<(Arc<Job>, Taken), Error> {
         let here = HostId::new("plant").unwrap();
-        let taken = jobs.take(
+        jobs.take(
             &here,
             draft,
             Work::Steps(vec![JobStep::Wait { ms: 1 }], 1),
             Duration::from_secs(1),
+        )
+    }
+
+    #[test]
+    fn many_clients_at_once_do_not_pass_the_bound_together() {
+        let jobs = Jobs::new(1, Clock::start());
+        let begin = std::sync::Barrier::new(8);
+        let taken: usize = std::thread::scope(|scope| {
+            let client = || {
+                begin.wait();
+                (0..JOBS_WAITING_MAX)
+                    .filter(|_| take(&jobs, draft("a", None)).is_ok())
+                    .count()
+            };
+            let clients: Vec<_> = (0..8).map(|_| scope.spawn(client)).collect();
+            clients.into_iter().map(|client| client.join().unwrap()).sum()
+        });
+        assert_eq!(
+            (taken, jobs.waiting("a") as usize),
+            (JOBS_WAITING_MAX, JOBS_WAITING_MAX)
         );
-        if let Ok((job, true)) = &taken {
-            jobs.enqueue(job);
-        }
-        taken
+    }
+
+    #[test]
+    fn those_that_waited_too_long_go_and_nothing_else_holds_them() {
+        let jobs = Jobs::new(1, Clock::start());
+        let (first, how) = take(&jobs, draft("a", None)).unwrap();
+        assert_eq!(how, Taken::Idle);
+        let (second, how) = take(
+            &jobs,
+            JobDraft {
+                queue_ms: 60_000,
+                ..draft("a", None)
+            },
+        )
+        .unwrap();
+        assert_eq!(how, Taken::Queued);
+        assert_eq!(jobs.next_over(), Some(first.queue_until));
+        assert!(jobs.take_over(Instant::now()).is_empty());
+        let over = jobs.take_over(first.queue_until);
+        assert_eq!(over.iter().map(|job| job.number).collect::<Vec<_>>(), [first.number]);
+        assert_eq!(first.view.lock().state, JobState::Expired);
+        assert_eq!(jobs.next_over(), Some(second.queue_until));
+        jobs.drop_queued(&second, JobState::Cancelled, "");
+        assert_eq!(jobs.next_over(), None);
+        // The list of what is kept, this test, and no sleeper.
+        drop(over);
+        assert_eq!((Arc::strong_count(&first), Arc::strong_count(&second)), (2, 2));
     }
 
     #[test]
     fn queues_are_bounded_per_bus_and_keys_make_twice_once() {
         let jobs = Jobs::new(7, Clock::start());
         let (first, new) = take(&jobs, draft("a", Some("k"))).unwrap();
-        assert!(new && first.number == 7_000_008, "{}", first.number);
+        assert!(new == Taken::Idle && first.number == 7_000_008, "{}", first.number);
         let (again, new) = take(&jobs, draft("a", Some("k"))).unwrap();
-        assert!(!new && again.number == first.number);
+        assert!(new == Taken::Known && again.number == first.number);
         let other = JobDraft {
             task: JobTask::Named("y".to_owned()),
             ..draft("a", Some("k"))

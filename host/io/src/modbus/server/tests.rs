@@ -92,6 +92,7 @@ impl Registers for Memory {
 fn client() -> Client {
     Client {
         address: ([127, 0, 0, 1], 9).into(),
+        role: None,
     }
 }
 
@@ -107,7 +108,7 @@ fn runtime() -> Runtime {
 fn each_function_and_each_refusal() {
     let memory = Memory::new();
     let runtime = runtime();
-    let ask = |unit: u8, pdu: &[u8]| runtime.block_on(answer(&memory, &client(), unit, pdu));
+    let ask = |unit: u8, pdu: &[u8]| runtime.block_on(answer(&memory, &Masks::default(), &client(), unit, pdu));
     let table: [(&[u8], &[u8]); 18] = [
         (&[3, 0, 2, 0, 2], &[3, 4, 0, 2, 0, 3]),
         (&[4, 0, 2, 0, 1], &[4, 2, 0, 2]),
@@ -252,6 +253,7 @@ proptest! {
         runtime.block_on(async {
             let (near, mut far) = tokio::io::duplex(64 * 1024);
             let mut connected = Connected {
+                masks: Arc::default(),
                 client: client(),
                 options: ServerOptions {
                     name: "test".to_owned(),
@@ -296,4 +298,48 @@ proptest! {
         });
         drop(stop);
     }
+}
+
+/// Takes a write at once, and does it when others have had their turn.
+struct Late(Arc<Memory>);
+
+impl Registers for Late {
+    fn unit(&self, unit: u8) -> Result<(), Exception> {
+        self.0.unit(unit)
+    }
+
+    fn bits(&self, table: Table, start: u16, count: u16) -> Result<Vec<bool>, Exception> {
+        self.0.bits(table, start, count)
+    }
+
+    fn words(&self, table: Table, start: u16, count: u16) -> Result<Vec<u16>, Exception> {
+        self.0.words(table, start, count)
+    }
+
+    fn write(&self, client: &Client, write: Write) -> Writing {
+        let (memory, client) = (Arc::clone(&self.0), client.clone());
+        Box::pin(async move {
+            for _ in 0..4 {
+                tokio::task::yield_now().await;
+            }
+            memory.write(&client, write).await
+        })
+    }
+
+    fn identity(&self) -> &Identity {
+        self.0.identity()
+    }
+}
+
+#[test]
+fn two_clients_that_mask_one_register_lose_no_bit() {
+    let (late, masks, client) = (Late(Arc::new(Memory::new())), Masks::default(), client());
+    let mask = |bit: u8| {
+        let pdu = [22, 0, 20, 0xFF, !(1 << bit), 0, 1 << bit];
+        let (late, masks, client) = (&late, &masks, &client);
+        async move { answer(late, masks, client, 1, &pdu).await }
+    };
+    late.0.words.lock()[20] = 0;
+    runtime().block_on(async { tokio::join!(mask(0), mask(1), mask(2), mask(3)) });
+    assert_eq!(late.0.words.lock()[20], 0b1111);
 }
