@@ -249,7 +249,10 @@ impl World {
     }
 
     fn dispatch(&mut self, number: u32, dispatch: Option<Dispatch>) {
-        let Some(Dispatch::Send(sample)) = dispatch else { return };
+        let Some(Dispatch::Send(mut sample)) = dispatch else {
+            return;
+        };
+        sample.resume.take_if(|_| self.broken() == Some(Broken::NoResume));
         let (home, owner) = (self.loops[number as usize].home, host_number(&sample.owner));
         if home == owner {
             self.sample(home, sample);

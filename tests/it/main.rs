@@ -9,6 +9,7 @@
 //! | commissioning | points by hand, forces, jobs, point lists |
 //! | masters | two hosts for one device |
 //! | members | frozen owners, late hosts, hosts that leave |
+//! | clocks | dates that are apart, that step, that went back |
 //! | drain | hosts that are emptied, restarted one by one, preferred, cut off |
 //! | chaos | faults by a seed, under the checker |
 //! | history | replays, backtests, shadows |
@@ -39,6 +40,7 @@ mod api;
 mod calls;
 mod changes;
 mod chaos;
+mod clocks;
 mod commissioning;
 mod drain;
 mod guides;

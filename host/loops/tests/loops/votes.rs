@@ -48,6 +48,58 @@ fn the_majority_is_taken_and_the_one_that_errs_loses_its_vote() {
     assert!(jump < 2.0, "an output jumped by {jump}");
 }
 
+/// Judges every output in turn, from the first cycle in which a turned bit would show.
+#[track_caller]
+fn no_jump(bench: &Bench, name: &str) {
+    let rows = || bench.seen.iter().skip(JUDGED_FROM_CYCLE);
+    let greatest = rows()
+        .zip(rows().skip(1))
+        .map(|(before, after)| ((after.outputs[0] - before.outputs[0]) / before.outputs[0].max(10.0)).abs())
+        .fold(0.0, f64::max);
+    // A turned bit moves an output by a quarter at least.
+    assert!(greatest < 0.2, "an output jumped by {greatest} of itself");
+    let first = rows().find(|r| dissent(r, name)).unwrap();
+    assert!(first.outputs[0] > 10.0, "the first dissent is judged: {}", first.outputs[0]);
+}
+
+/// The loop's own first cycles, from nothing to its setpoint, are as steep as an error.
+const JUDGED_FROM_CYCLE: usize = 60;
+
+#[test]
+fn not_even_the_first_wrong_step_reaches_the_actuator() {
+    // Steps of a replica, and of the owner itself.
+    for errs in ["a", "b", "c"] {
+        let mut bench = Bench::with_errors(&["a", "b", "c"], &[(errs, 100)], |spec| {
+            spec.strategy = Strategy::Vote(3);
+        });
+        let first = bench.until("its first wrong step", |r| dissent(r, errs));
+        assert!(first.faults_in_row == 0 && first.seq > JUDGED_FROM_CYCLE as u64);
+        for _ in 0..10 {
+            bench.next();
+        }
+        no_jump(&bench, errs);
+    }
+}
+
+#[test]
+fn one_that_errs_is_never_alone_with_the_actuator() {
+    // Every step of b is wrong, and one of the others is gone.
+    let mut bench = Bench::with_errors(&["a", "b", "c"], &[("b", 1)], |spec| spec.strategy = Strategy::Vote(3));
+    bench.until("dissent", |r| dissent(r, "b"));
+    bench.settled();
+    let owner = bench.next().owner.clone();
+    let other = if owner == host("c") { host("a") } else { host("c") };
+    bench.board.cut.lock().unwrap().insert(other);
+    let held = bench.until("no majority", no_majority);
+    for _ in 0..30 {
+        let record = bench.next();
+        assert!(no_majority(&record) && record.faults_in_row > 0, "{:?}", record.events);
+        assert_eq!(record.outputs, held.outputs, "the output holds");
+    }
+    bench.board.cut.lock().unwrap().clear();
+    bench.until("it goes on by itself", |r| r.faults_in_row == 0);
+}
+
 #[test]
 fn one_that_erred_once_votes_again_after_clean_steps() {
     let every = u64::from(CLEAN_STEPS) * 3;
@@ -113,7 +165,10 @@ fn cut_all_but_the_owner(bench: &mut Bench) -> HostId {
 
 #[test]
 fn with_fewer_than_asked_for_a_vote_goes_on_where_the_policy_lets_it() {
-    let mut bench = Bench::new(&["a", "b", "c"], |spec| spec.strategy = Strategy::Vote(3));
+    let mut bench = Bench::new(&["a", "b", "c"], |spec| {
+        spec.strategy = Strategy::Vote(3);
+        spec.policy.on_fewer = OnFewer::GoOn;
+    });
     bench.until("all vote", |r| r.redundancy.whole());
     let owner = cut_all_but_the_owner(&mut bench);
     let alone = bench.until("it goes on alone", |r| r.redundancy.have == 1 && r.faults_in_row == 0);
@@ -132,11 +187,8 @@ fn with_fewer_than_asked_for_a_vote_goes_on_where_the_policy_lets_it() {
 }
 
 #[test]
-fn with_fewer_than_asked_for_a_vote_stops_where_the_policy_says_so() {
-    let mut bench = Bench::new(&["a", "b", "c"], |spec| {
-        spec.strategy = Strategy::Vote(3);
-        spec.policy.on_fewer = OnFewer::Fault;
-    });
+fn with_fewer_than_a_majority_a_vote_stops_unless_the_policy_says_otherwise() {
+    let mut bench = Bench::new(&["a", "b", "c"], |spec| spec.strategy = Strategy::Vote(3));
     bench.until("all vote", |r| r.redundancy.whole());
     cut_all_but_the_owner(&mut bench);
     let stopped = bench.until("one alone is no majority", |r| r.redundancy.have == 1 && no_majority(r));
