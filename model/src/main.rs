@@ -98,7 +98,9 @@ fn every_course(options: &Options, what: &str, bounds: Bounds) -> bool {
             broken.push(rule);
         }
     }
-    let unseen: Vec<&str> = signs(&bounds).filter(|sign| checker.discovery(sign).is_none()).collect();
+    let unseen: Vec<&str> = signs(&bounds)
+        .filter(|sign| checker.discovery(sign).is_none())
+        .collect();
     for sign in &unseen {
         options.say(&format!("    NEVER SEEN: {sign}"));
     }

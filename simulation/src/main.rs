@@ -316,7 +316,12 @@ fn sizes(plan: &Plan, sizes: &[u32], report: &mut Report) -> Result<(), Error> {
         ("messages of cycles, vitals, standings and probes", of_all),
     ] {
         if let (Some(first), Some(last)) = (rates.first(), rates.last()) {
-            report.at_most(&format!("{what} per host, largest cell over smallest"), last / first, "", GROWTH_MAX);
+            report.at_most(
+                &format!("{what} per host, largest cell over smallest"),
+                last / first,
+                "",
+                GROWTH_MAX,
+            );
         }
     }
     Ok(())

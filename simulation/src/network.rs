@@ -186,8 +186,14 @@ mod tests {
         assert!((20..25).contains(&passed), "as many as fit in the queue: {passed}");
         let (each_ns, wait_ns_max) = SATURATED;
         let longest_ns = sent.iter().flatten().max().copied().unwrap_or_default();
-        assert!(longest_ns > wait_ns_max, "the last waits for all before it: {longest_ns}");
-        assert!(network.ways(0, 2, 1_000)[0].is_some_and(|ns| ns < each_ns), "others are free");
+        assert!(
+            longest_ns > wait_ns_max,
+            "the last waits for all before it: {longest_ns}"
+        );
+        assert!(
+            network.ways(0, 2, 1_000)[0].is_some_and(|ns| ns < each_ns),
+            "others are free"
+        );
         assert!(
             network.ways(1, 0, 1_000_000_000)[0].is_some_and(|ns| ns >= each_ns),
             "both directions share it, and it empties"

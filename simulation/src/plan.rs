@@ -324,11 +324,9 @@ impl Plan {
                 FaultKind::Pause => random.spread(MS, 60_000 * MS) / MS,
                 FaultKind::Kill | FaultKind::Clock => random.spread(50, 20_000),
                 FaultKind::Partition => random.spread(20, 30_000),
-                FaultKind::Loss
-                | FaultKind::Saturation
-                | FaultKind::Disk
-                | FaultKind::Slow
-                | FaultKind::Bits => random.spread(100, 20_000),
+                FaultKind::Loss | FaultKind::Saturation | FaultKind::Disk | FaultKind::Slow | FaultKind::Bits => {
+                    random.spread(100, 20_000)
+                }
             };
             let host = random.between(0, u64::from(self.hosts)) as u32;
             let mut hosts = vec![host];

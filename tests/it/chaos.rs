@@ -77,7 +77,9 @@ fn faults_of_many_kinds_break_no_promise() {
 
 fn told(record: &Value, kinds: &[&str]) -> bool {
     let events = record["events"].as_array().map(Vec::as_slice).unwrap_or_default();
-    events.iter().any(|event| kinds.iter().any(|kind| event["kind"] == *kind))
+    events
+        .iter()
+        .any(|event| kinds.iter().any(|kind| event["kind"] == *kind))
 }
 
 #[test]
@@ -97,7 +99,8 @@ fn a_loop_whose_link_carries_too_little_goes_on_and_says_so() {
     })
     .unwrap();
     let feed = api.live("?loops=loop-0").unwrap();
-    feed.record_where("a cycle of its owner", |record| record["owner"] == "a").unwrap();
+    feed.record_where("a cycle of its owner", |record| record["owner"] == "a")
+        .unwrap();
 
     // A sample and a commit each have some hundred bytes, twenty times a second.
     let relay = cell.relay.as_ref().unwrap();
@@ -119,8 +122,10 @@ fn a_loop_whose_link_carries_too_little_goes_on_and_says_so() {
     for way in [Way::Away, Way::Back] {
         relay.narrow(way, None);
     }
-    feed.record_where("a step of the host whose link is wide again", |record| record["stepped_by"] == "a")
-        .unwrap();
+    feed.record_where("a step of the host whose link is wide again", |record| {
+        record["stepped_by"] == "a"
+    })
+    .unwrap();
     let journal = cell.journal().unwrap();
     one_writer(&journal);
     assert!(lost < 20, "a takeover, and not a standstill: {lost} cycles lost");

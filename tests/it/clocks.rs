@@ -39,7 +39,12 @@ fn dates_apart_and_stepping_cost_no_cycle_and_no_order() {
     if cell.dates() {
         // Forth and back, by hours and by days; the home's too.
         let steps: [[(&str, i64); 4]; 2] = [
-            [("plant", 30 * 86_400), ("a", -7_200), ("b", 5 * 3_600), ("c", -40 * 86_400)],
+            [
+                ("plant", 30 * 86_400),
+                ("a", -7_200),
+                ("b", 5 * 3_600),
+                ("c", -40 * 86_400),
+            ],
             [("plant", -86_400), ("a", 86_400), ("b", -23 * 3_600), ("c", 3_600)],
         ];
         for step in steps {
@@ -48,8 +53,10 @@ fn dates_apart_and_stepping_cost_no_cycle_and_no_order() {
             }
             let from = whole(&api.loop_view(LOOP).unwrap()["seq"]);
             // Three seconds: the means is looked at once a second.
-            feed.record_where("cycles after the step", |record| record["seq"].as_u64() > Some(from + 6))
-                .unwrap();
+            feed.record_where("cycles after the step", |record| {
+                record["seq"].as_u64() > Some(from + 6)
+            })
+            .unwrap();
         }
     } else {
         eprintln!("NOT RUN: dates that step, for there is no libfaketime here (Debian: faketime)");
@@ -67,7 +74,11 @@ fn dates_apart_and_stepping_cost_no_cycle_and_no_order() {
     let taken = feed
         .record_where("a cycle of another owner", |record| record["owner"] != owner.as_str())
         .unwrap();
-    assert!((number(&taken["setpoint"]) - 47.0).abs() < 1e-9, "{}", taken["setpoint"]);
+    assert!(
+        (number(&taken["setpoint"]) - 47.0).abs() < 1e-9,
+        "{}",
+        taken["setpoint"]
+    );
     cell.restart(&owner).unwrap();
     cell.wait_joined().unwrap();
     api.wait_for_loop(LOOP, "all members again", |view| names(&view["members"]).len() == 3)
@@ -79,8 +90,10 @@ fn dates_apart_and_stepping_cost_no_cycle_and_no_order() {
     ahead.upload_stock(&["pidplus"]).unwrap();
     let known = |api: &bumpless_tests::Api| api.components().unwrap().iter().any(|c| c["name"] == "pidplus");
     let wait = |api: &bumpless_tests::Api, there: bool| {
-        api.wait_until("the library to follow", |api| if known(api) == there { Ok(()) } else { Err(there) })
-            .unwrap();
+        api.wait_until("the library to follow", |api| {
+            if known(api) == there { Ok(()) } else { Err(there) }
+        })
+        .unwrap();
     };
     wait(&behind, true);
     ahead.delete("/v1/components/pidplus").unwrap();

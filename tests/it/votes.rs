@@ -85,7 +85,10 @@ fn a_host_that_errs_is_outvoted_named_and_kept_from_the_actuator() {
     let step = greatest_step(&journal, ..=to);
     assert!(step < STEP_MAX, "the output stepped by {step} of itself");
     let first = dissent["seq"].as_u64().unwrap();
-    assert!(journal.of(POINT).any(|w| w.seq == first), "the first dissent's cycle was written");
+    assert!(
+        journal.of(POINT).any(|w| w.seq == first),
+        "the first dissent's cycle was written"
+    );
 
     // The same host without a vote over it: now it shows, so the check above could have failed.
     api.strategy(LOOP, "round-robin").unwrap();

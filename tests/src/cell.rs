@@ -5,9 +5,7 @@ use std::{collections::BTreeMap, net::SocketAddr, path::Path, sync::Arc, time::D
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-use crate::{
-    Api, Disk, Error, HostOptions, HostProcess, Journal, Net, Relay, chaos::dates, slots::Slot, wait_until,
-};
+use crate::{Api, Disk, Error, HostOptions, HostProcess, Journal, Net, Relay, chaos::dates, slots::Slot, wait_until};
 
 /// Name of the host with the plant.
 pub const PLANT: &str = "plant";

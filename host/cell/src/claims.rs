@@ -127,8 +127,14 @@ mod tests {
             assert!(!claims.appear(&Instance::new(0, other)), "and one is enough");
             assert!(claims.speak());
             assert!(!claims.hear(&me, 1_000_000, &claim(other, 999_990)), "it joined later");
-            assert!(claims.hear(&me, 1_000_000, &claim(other, 1_000_010)), "it joined before");
-            assert!(!claims.hear(&me, 1_000_000, &claim(other, 2_000_000)), "left once is left");
+            assert!(
+                claims.hear(&me, 1_000_000, &claim(other, 1_000_010)),
+                "it joined before"
+            );
+            assert!(
+                !claims.hear(&me, 1_000_000, &claim(other, 2_000_000)),
+                "left once is left"
+            );
             assert!(!claims.speak() && !claims.appear(&Instance::new(0, other)));
         }
     }

@@ -4,10 +4,7 @@
 //! session alive (it holds it weakly).
 
 use std::{
-    sync::{
-        Arc, OnceLock, Weak,
-        atomic::AtomicUsize,
-    },
+    sync::{Arc, OnceLock, Weak, atomic::AtomicUsize},
     time::{Duration, Instant},
 };
 

@@ -444,15 +444,17 @@ async fn waiting<T: Send + 'static>(host: &HostId, call: impl FnOnce() -> T + Se
 
 /// One life: the random identity that Zenoh drew for the session.
 fn instance(zenoh: &zenoh::Session) -> Instance {
-    let (low, high) = zenoh.zid().to_le_bytes().into_iter().enumerate().fold(
-        (0, 0),
-        |(low, high), (place, byte)| {
+    let (low, high) = zenoh
+        .zid()
+        .to_le_bytes()
+        .into_iter()
+        .enumerate()
+        .fold((0, 0), |(low, high), (place, byte)| {
             if place < 8 {
                 (low << 8 | u64::from(byte), high)
             } else {
                 (low, high << 8 | u64::from(byte))
             }
-        },
-    );
+        });
     Instance::new(high, low)
 }

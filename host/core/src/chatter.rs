@@ -68,7 +68,11 @@ mod tests {
     fn what_a_host_receives_is_bounded_whatever_the_size_of_its_cell() {
         let most = 2.0 * TOLD_PER_S_MAX as f64 + 2.0 * PROBES_PER_TURN_MAX as f64 * 1e9 / PROBE_NS as f64;
         for hosts in [51, 100, 1_000, 10_000] {
-            assert!((received_per_s(hosts) - most).abs() < 1e-6, "{hosts}: {}", received_per_s(hosts));
+            assert!(
+                (received_per_s(hosts) - most).abs() < 1e-6,
+                "{hosts}: {}",
+                received_per_s(hosts)
+            );
         }
         assert!((0..200).all(|hosts| received_per_s(hosts) <= most + 1e-6));
         assert_eq!(pause_ns(VITALS_NS_MIN, usize::MAX), u64::MAX, "no overflow");

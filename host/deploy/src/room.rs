@@ -43,9 +43,7 @@ use crate::{
     holder::Holder,
     home::Homes,
     library::Library,
-    limits::{
-        CHANGES_MAX, NOTICES_WAITING_MAX, RECONCILE_EVERY, REHEARSALS_MAX, SENDING_MAX, UPLOADS_MAX,
-    },
+    limits::{CHANGES_MAX, NOTICES_WAITING_MAX, RECONCILE_EVERY, REHEARSALS_MAX, SENDING_MAX, UPLOADS_MAX},
     rollout::ledger::Ledger,
     roster::Roster,
     shadows::Shadows,

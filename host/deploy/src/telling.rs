@@ -134,9 +134,17 @@ mod tests {
         let vitals = crate::roster::test_vitals(&HostId::new("a").unwrap());
         let start = Instant::now();
         let mut told = LastTold::default();
-        assert!(told.is_vitals_due(&vitals, 1_000, start) && told.is_standing_due(1_000, start), "a first word");
+        assert!(
+            told.is_vitals_due(&vitals, 1_000, start) && told.is_standing_due(1_000, start),
+            "a first word"
+        );
         (told.vitals, told.standing) = (Some((start, vitals.clone())), Some(start));
-        for (hosts, vitals_ms, standing_ms) in [(2, 200, 1_000), (11, 200, 1_000), (101, 2_000, 2_000), (1_001, 20_000, 20_000)] {
+        for (hosts, vitals_ms, standing_ms) in [
+            (2, 200, 1_000),
+            (11, 200, 1_000),
+            (101, 2_000, 2_000),
+            (1_001, 20_000, 20_000),
+        ] {
             let at = |ms: u64| start + Duration::from_millis(ms);
             assert!(!told.is_vitals_due(&vitals, hosts, at(vitals_ms / 2 - 1)), "{hosts}");
             assert!(told.is_vitals_due(&vitals, hosts, at(vitals_ms)), "{hosts}");

@@ -92,7 +92,9 @@ impl Replicas {
                 }
                 None => {}
             }
-            let wanted = replica.wanted_ns.is_some_and(|at_ns| now_ns.saturating_sub(at_ns) < WANTED_NS);
+            let wanted = replica
+                .wanted_ns
+                .is_some_and(|at_ns| now_ns.saturating_sub(at_ns) < WANTED_NS);
             let key = (!wanted, replica.probed_ns);
             drop(replica);
             free.push((key, host, entry));
@@ -230,7 +232,10 @@ mod tests {
         // More replicas than places: they take turns, and one place stays for the others.
         let many: Vec<HostId> = (1..=30).map(host).collect();
         let count = turns(&replicas, 51, 100, &many);
-        assert!(many.iter().all(|h| count[h] >= 100 * PROBES_WANTED_MAX as u64 / 30 - 1), "{count:?}");
+        assert!(
+            many.iter().all(|h| count[h] >= 100 * PROBES_WANTED_MAX as u64 / 30 - 1),
+            "{count:?}"
+        );
         assert_eq!(count.len(), 100, "everybody was probed");
         // A loop that went: its members are hosts like others after a while.
         let later = 151 + WANTED_NS / TURN_NS;

@@ -17,7 +17,11 @@ const FILE: &str = "date";
 /// Where the library is, if it is installed.
 pub(crate) fn library() -> Option<PathBuf> {
     let folders = |root: &str| {
-        let inner = fs::read_dir(root).into_iter().flatten().flatten().map(|entry| entry.path());
+        let inner = fs::read_dir(root)
+            .into_iter()
+            .flatten()
+            .flatten()
+            .map(|entry| entry.path());
         std::iter::once(PathBuf::from(root)).chain(inner)
     };
     ["/usr/lib", "/usr/lib64", "/usr/local/lib"]
@@ -79,7 +83,11 @@ mod tests {
         let environment = prepare(&library, folder.path()).unwrap();
         for by_s in [0, 86_400, -7_200] {
             step(folder.path(), by_s).unwrap();
-            let output = Command::new("date").arg("+%s").envs(environment.clone()).output().unwrap();
+            let output = Command::new("date")
+                .arg("+%s")
+                .envs(environment.clone())
+                .output()
+                .unwrap();
             let told: i64 = String::from_utf8(output.stdout).unwrap().trim().parse().unwrap();
             let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap().as_secs();
             let off_s = told - i64::try_from(now).unwrap();

@@ -306,14 +306,14 @@ impl Inflictor {
     }
 
     /// Steps the dates of some hosts, one at least: the home's by whole days, so that its log can be read, the others' by hours.
-    fn step_dates(&mut self, choice: u64) -> Result<String, Error> {
+    fn step_dates(&self, choice: u64) -> Result<String, Error> {
         let mut words = Vec::new();
-        let count = self.cell.hosts().count() as u64;
-        for (n, host) in (0..).zip(self.cell.hosts()) {
-            if choice >> n & 1 == 0 && choice % count != n {
+        let count = self.cell.hosts().count();
+        for (n, host) in self.cell.hosts().enumerate() {
+            if choice >> n & 1 == 0 && choice % count as u64 != n as u64 {
                 continue;
             }
-            let draw = choice.rotate_right(7 * (n as u32 + 1));
+            let draw = choice.rotate_right(u32::try_from(7 * (n + 1)).unwrap_or(0));
             let (unit, unit_s, most) = if host.name == PLANT {
                 ("days", 86_400, DAYS_MAX)
             } else {
@@ -501,7 +501,10 @@ fn parts(choice: u64, possible: &[Part]) -> Vec<Part> {
     let turn = usize::try_from(choice >> 32).unwrap_or(0) % more.len().max(1);
     more.rotate_left(turn);
     more.truncate(missing);
-    let chosen = possible.iter().enumerate().filter(|(n, _)| named(*n) || more.contains(n));
+    let chosen = possible
+        .iter()
+        .enumerate()
+        .filter(|(n, _)| named(*n) || more.contains(n));
     chosen.map(|(_, part)| *part).collect()
 }
 

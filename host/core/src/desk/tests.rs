@@ -173,7 +173,10 @@ fn who_is_silent_again_and_again_is_passed_over_twice_as_long_and_a_minute_at_mo
     let later_ns = at_ns + SUSPECT_NS_MAX;
     let mut remembered = desk.clone();
     let struck_ns = silent(&mut remembered, later_ns - 1);
-    assert!(passed_over(&remembered, struck_ns + SUSPECT_NS_MAX - 1), "not yet forgotten");
+    assert!(
+        passed_over(&remembered, struck_ns + SUSPECT_NS_MAX - 1),
+        "not yet forgotten"
+    );
     let struck_ns = silent(&mut desk, later_ns);
     assert!(!passed_over(&desk, struck_ns + 1_000_000_000), "forgotten");
 }
