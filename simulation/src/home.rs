@@ -304,7 +304,7 @@ impl World {
                 let Some(owner) = desk.owner().cloned() else { return };
                 (record.term, record.owner) = (desk.term(), owner);
             }
-            (Some(Refusal::WrongBase), Some(Broken::AnyBase)) => {
+            (Some(Refusal::WrongBase), Some(Broken::AnyBase | Broken::Unchained)) => {
                 record.after = desk.last().map_or((0, 0), |last| last.position());
             }
             (Some(_), _) => return,

@@ -62,7 +62,7 @@ struct Options {
     /// Shows the course of this loop at the end.
     #[arg(long)]
     trace: Option<u32>,
-    /// Takes a rule away: no-terms, any-base, outputs-apart, terms-again, told-too-soon, first-answer, no-resume; or `all`, one
+    /// Takes a rule away: no-terms, any-base, outputs-apart, terms-again, told-too-soon, first-answer, no-resume, unchained; or `all`, one
     /// after the other, each of which must be noticed.
     #[arg(long)]
     broken: Option<String>,

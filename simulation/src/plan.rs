@@ -156,11 +156,13 @@ pub enum Broken {
     FirstAnswer,
     /// Whoever asks for the last record, or takes over, does not get it.
     NoResume,
+    /// Owners do not say which record theirs goes on from, and the home does not ask.
+    Unchained,
 }
 
 impl Broken {
     /// All of them.
-    pub const ALL: [Self; 7] = [
+    pub const ALL: [Self; 8] = [
         Self::NoTerms,
         Self::AnyBase,
         Self::OutputsApart,
@@ -168,6 +170,7 @@ impl Broken {
         Self::ToldTooSoon,
         Self::FirstAnswer,
         Self::NoResume,
+        Self::Unchained,
     ];
 
     /// The word for it.
@@ -181,6 +184,7 @@ impl Broken {
             Self::ToldTooSoon => "told-too-soon",
             Self::FirstAnswer => "first-answer",
             Self::NoResume => "no-resume",
+            Self::Unchained => "unchained",
         }
     }
 }

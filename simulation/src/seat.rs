@@ -464,7 +464,7 @@ impl World {
         let step_ns = self.step_ns(host);
         let probation = swap::probation_after(running.base.as_deref());
         let home = host_number(&running.sample.home);
-        let record = seat::conclude(Conclusion {
+        let mut record = seat::conclude(Conclusion {
             owner: &me,
             sample: &running.sample,
             base: running.base.as_deref(),
@@ -483,6 +483,9 @@ impl World {
             }),
             cycle_ns: now_ns.saturating_sub(running.started_ns),
         });
+        if self.broken() == Some(Broken::Unchained) {
+            record.after = (0, 0);
+        }
         if home != host
             && let Some(seat) = self.host_mut(host).seats.get_mut(&number)
         {

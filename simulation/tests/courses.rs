@@ -99,7 +99,8 @@ fn each_broken_rule_is_noticed_and_each_rule_notices_one() {
         let (must, may): (&[&str], &[&str]) = match broken {
             // The owner before may be the owner again: then it is its old cycle that shows.
             Broken::NoTerms => (&[RULES[0]], &[RULES[1]]),
-            Broken::AnyBase => (&[RULES[2], RULES[3]], &[]),
+            Broken::AnyBase => (&[RULES[2]], &[RULES[3]]),
+            Broken::Unchained => (&[RULES[3]], &[]),
             Broken::OutputsApart | Broken::FirstAnswer => (&[RULES[2]], &[]),
             // A home that forgets its terms forgets its records with them.
             Broken::TermsAgain => (&[RULES[1]], &[RULES[4]]),
