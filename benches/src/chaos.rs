@@ -35,6 +35,8 @@ pub(crate) const PROFILE: Profile = Profile {
 };
 /// Bytes of the small disks: a store, compiled components and some history.
 const DISK_BYTES: u64 = 96 * 1024 * 1024;
+/// How far the dates of the controller hosts are off from the beginning, in h.
+const APART_H: [(&str, i64); CONTROLLERS] = [("a", -11), ("b", 7), ("c", -3), ("d", 23)];
 /// Quiet between two faults, in ms, least and greatest.
 const QUIET_MS: (u64, u64) = (500, 3_000);
 /// Of the whole time, the part that is left undisturbed, to compare with.
@@ -167,7 +169,10 @@ fn start(wishes: &Wishes, report: &Report) -> Result<Cell, Error> {
         None
     } else {
         match Net::new(1 + CONTROLLERS) {
-            Ok(net) => Some(Arc::new(net)),
+            Ok(net) => {
+                report.progress(&format!("hosts are cut off by {}", net.means()));
+                Some(Arc::new(net))
+            }
             Err(error) => {
                 report.progress(&format!(
                     "no network namespaces here ({error}): all hosts on the loopback interface, and only the relayed link is cut"
@@ -186,6 +191,11 @@ fn start(wishes: &Wishes, report: &Report) -> Result<Cell, Error> {
         net: net.clone(),
         relayed: Some("a".to_owned()),
         disks,
+        dates: true,
+        heads: APART_H
+            .iter()
+            .map(|(host, hours)| ((*host).to_owned(), format!("clock_offset_s = {}\n", hours * 3_600)))
+            .collect(),
         ..CellOptions::first_order(&format!(
             "{{ count = {LOOPS}, gain = 1.0, tau_s = 1.0, dead_time_s = 0.1, noise = 0.002 }}"
         ))

@@ -31,7 +31,8 @@ impl Part {
     fn bounds(&self, label: &str) -> (Bound, Bound) {
         match (self.name, label) {
             ("replica" | "pause", _) => (Bound::AtMost(0.0), Bound::Below(1.5)),
-            ("owner", "10hz") => (Bound::None, Bound::AtMost(2.0)),
+            // At most one late cycle for each death.
+            ("owner", _) => (Bound::AtMost(self.faults as f64), Bound::AtMost(2.0)),
             _ => (Bound::None, Bound::None),
         }
     }

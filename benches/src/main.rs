@@ -9,7 +9,6 @@ mod call;
 mod chaos;
 mod chaos_report;
 mod conditions;
-mod delay;
 mod devices;
 mod error;
 mod failover;

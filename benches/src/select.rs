@@ -7,17 +7,16 @@
 //! All hosts share this machine, so each is bound to a core, and what a host says of its load is that of its core.
 
 use std::{
-    net::SocketAddr,
+    net::{Ipv4Addr, SocketAddr},
     time::{Duration, Instant},
 };
 
 use bumpless_io::Clock;
-use bumpless_tests::{Api, HostOptions, HostProcess, PLANT, wait_until};
+use bumpless_tests::{Api, HostOptions, HostProcess, PLANT, Relay, Way, wait_until};
 use serde_json::json;
 
 use crate::{
     Options,
-    delay::Relay,
     error::Error,
     history::{History, PATIENCE},
     report::{Bound, Report},
@@ -63,7 +62,7 @@ fn address(locator: &str) -> Result<SocketAddr, Error> {
 }
 
 impl Hosts {
-    fn start(runtime: &tokio::runtime::Runtime) -> Result<Self, Error> {
+    fn start() -> Result<Self, Error> {
         let folder = tempfile::tempdir().map_err(Error::io("a folder for the hosts cannot be made"))?;
         let cell = format!("select-{}", std::process::id());
         let host = |name: &str, connect: Vec<String>, tables: &str| {
@@ -86,7 +85,7 @@ impl Hosts {
             what: "an address of a".to_owned(),
             seconds: 0,
         })?;
-        let relay = runtime.block_on(Relay::start(of_owner))?;
+        let relay = Relay::start(Ipv4Addr::LOCALHOST.into(), of_owner)?;
         // It knows nobody but a, and a only through the relay; the others it finds through a, and once there is a link to
         // a host no second one is made.
         let c = host(VICTIM, vec![format!("tcp/{}", relay.address)], "")?;
@@ -139,9 +138,8 @@ pub(crate) fn run(options: Options, report: &mut Report) -> Result<(), Error> {
         return Err(Error::Cores(cores.len()));
     };
     let rounds = options.count(10, 2);
-    let runtime = tokio::runtime::Runtime::new().map_err(Error::io("a runtime cannot be started"))?;
     report.progress("a plant and three controllers; the owner knows one of them through a relay");
-    let hosts = Hosts::start(&runtime)?;
+    let hosts = Hosts::start()?;
     let api = hosts.plant.api();
     api.upload_stock(&["pid"])?;
     for (number, name) in LOOPS.iter().enumerate() {
@@ -184,21 +182,21 @@ pub(crate) fn run(options: Options, report: &mut Report) -> Result<(), Error> {
             Ok((until_ns, alone))
         },
     )?;
-    let bytes_before = hosts.relay.bytes();
+    let bytes_before = hosts.relay.bytes(Way::Back);
     let mut with_delay = Vec::new();
     let what = format!("{} ms from {OWNER} to {VICTIM}", DELAY.as_millis());
     let void_delay = run.rounds(report, &what, &["latency"], &mut [&mut latency], || {
-        hosts.relay.delay(DELAY);
+        hosts.relay.delay(Way::Back, DELAY);
         std::thread::sleep(BAD);
         with_delay.push(latency_ms(&hosts)?);
         let until_ns = clock.now_ns();
-        hosts.relay.delay(Duration::ZERO);
+        hosts.relay.delay(Way::Back, Duration::ZERO);
         Ok((until_ns, true))
     })?;
     report.told("select.latency.measured_with_delay", median(&with_delay), "ms");
     report.told("select.latency.measured_without_delay", latency_ms(&hosts)?, "ms");
     // Proof that the steps for the replica really went through the relay.
-    let bytes = hosts.relay.bytes() - bytes_before;
+    let bytes = hosts.relay.bytes(Way::Back) - bytes_before;
     report.figure("select.relay_bytes", bytes as f64, "bytes", Bound::AtLeast(20_000.0));
     report.told("select.void_rounds", f64::from(void_load + void_delay), "rounds");
 

@@ -266,7 +266,7 @@ impl Cell {
             Action::Overdue => {
                 state.now_ns = state.now_ns.max(state.desk.due_at_ns());
                 let dispatch = state.desk.overdue(state.now_ns);
-                state.send(dispatch);
+                self.send(&mut state, dispatch);
             }
             Action::Deliver(number) => {
                 let message = state.net.remove(number);
@@ -301,12 +301,19 @@ impl Cell {
                 let members = (0..state.hosts.len()).filter(|n| if *n == number { !gone } else { believed(n) });
                 let members = members.map(host_id).collect();
                 let dispatch = state.desk.set_members(state.now_ns, members);
-                state.send(dispatch);
+                self.send(&mut state, dispatch);
             }
             Action::Restart => self.restart(&mut state),
         }
         state.settle();
         state
+    }
+
+    fn send(&self, state: &mut State, dispatch: Option<Dispatch>) {
+        if let Some(Dispatch::Send(mut sample)) = dispatch {
+            sample.resume.take_if(|_| self.broken == Some(Broken::NoResume));
+            state.net.push(Message::Sample(sample));
+        }
     }
 
     fn deadline(&self, state: &mut State) {
@@ -318,7 +325,7 @@ impl Cell {
             .waiting_revision()
             .map(|revision| (revision, readings.clone()));
         let fired = state.desk.deadline(state.now_ns, readings, next);
-        state.send(fired.map(|(_, dispatch)| dispatch));
+        self.send(state, fired.map(|(_, dispatch)| dispatch));
     }
 
     fn deliver(&self, state: &mut State, message: Message) {
@@ -356,7 +363,7 @@ impl Cell {
                 Answer::Held { term, seq, .. } => state.told((term, seq)),
                 other => {
                     let dispatch = state.desk.answered(state.now_ns, &other);
-                    state.send(dispatch);
+                    self.send(state, dispatch);
                 }
             },
         }
@@ -501,7 +508,8 @@ impl Cell {
             .filter(|host| !host.dead)
             .filter_map(|host| host.last.clone());
         let last = told.chain(disk).max_by_key(|record| record.position());
-        let revision = last.as_ref().map_or(REVISIONS[0], |record| record.revision);
+        let known = last.as_ref().filter(|_| self.broken != Some(Broken::RevisionForgotten));
+        let revision = known.map_or(REVISIONS[0], |record| record.revision);
         let Some(law) = self.law(revision) else { return };
         let floor = last.clone().filter(|_| self.broken != Some(Broken::TermsAgain));
         let members = state.desk.members().to_vec();
@@ -521,7 +529,7 @@ impl Cell {
         }
         let everyone = (0..calm.hosts.len()).map(host_id).collect();
         let dispatch = calm.desk.set_members(calm.now_ns, everyone);
-        calm.send(dispatch);
+        self.send(&mut calm, dispatch);
         let before = calm.writes.len();
         for _ in 0..4 {
             while !calm.net.is_empty() {
@@ -544,12 +552,6 @@ impl State {
         let told = self.desk.kept(position).into_iter().map(|(applied, _)| applied);
         let done = told.filter(|applied| applied.outcome == Outcome::Done);
         self.acknowledged.extend(done.map(|applied| applied.id));
-    }
-
-    fn send(&mut self, dispatch: Option<Dispatch>) {
-        if let Some(Dispatch::Send(sample)) = dispatch {
-            self.net.push(Message::Sample(sample));
-        }
     }
 
     /// Brings the state into the one form that it is known by.

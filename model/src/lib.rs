@@ -21,5 +21,5 @@ mod rules;
 mod table;
 
 pub use cell::{Action, Bounds, Cell, State};
-pub use rules::{Broken, RULES};
+pub use rules::{Broken, RULES, SIGNS, signs};
 pub use table::{CELLS, DEEP, QUIET, REMOVALS, Removal};

@@ -5,7 +5,7 @@
 
 use std::{process::ExitCode, time::Instant};
 
-use bumpless_model::{Bounds, CELLS, Cell, DEEP, REMOVALS, RULES};
+use bumpless_model::{Bounds, CELLS, Cell, DEEP, REMOVALS, RULES, signs};
 use clap::Parser;
 use serde::Serialize;
 use stateright::{Checker, HasDiscoveries, Model};
@@ -98,6 +98,12 @@ fn every_course(options: &Options, what: &str, bounds: Bounds) -> bool {
             broken.push(rule);
         }
     }
+    let unseen: Vec<&str> = signs(&bounds)
+        .filter(|sign| checker.discovery(sign).is_none())
+        .collect();
+    for sign in &unseen {
+        options.say(&format!("    NEVER SEEN: {sign}"));
+    }
     let figure = |figure: String, value: f64, unit, bound, holds| Figure {
         figure,
         value,
@@ -110,7 +116,10 @@ fn every_course(options: &Options, what: &str, bounds: Bounds) -> bool {
     let good = broken.is_empty() && checker.is_done();
     let rules = format!("model, {what}: rules of {} that do not hold", RULES.len());
     options.figure(&figure(rules, broken.len() as f64, "", Some("<= 0"), good));
-    good
+    let of_signs = format!("model, {what}: what must be seen and never was");
+    let seen = unseen.is_empty();
+    options.figure(&figure(of_signs, unseen.len() as f64, "", Some("<= 0"), seen));
+    good && seen
 }
 
 /// Looks for a course that shows the absence of a rule.

@@ -5,7 +5,7 @@
 use bumpless_core::CommandBody;
 use stateright::{Model, Property};
 
-use crate::cell::{Action, Cell, State, command};
+use crate::cell::{Action, Bounds, Cell, State, command, host_id};
 
 /// A rule of the product, taken away.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -20,6 +20,10 @@ pub enum Broken {
     TermsAgain,
     /// A command is acknowledged when its record is taken, whoever has it.
     ToldTooSoon,
+    /// Whoever asks for the last record, or takes over, does not get it.
+    NoResume,
+    /// A home that restarts goes on with the first revision, whatever its last record says.
+    RevisionForgotten,
 }
 
 /// The names of the rules.
@@ -31,6 +35,29 @@ pub const RULES: [&str; 6] = [
     "the loop runs again",
     "a revision that was acknowledged stays in force",
 ];
+
+/// What must be seen in a cell where it can be: rules that hold in courses in which nothing happens say nothing.
+pub const SIGNS: [&str; 5] = [
+    "a takeover",
+    "a cycle without a write",
+    "an acknowledgement",
+    "another revision in force",
+    "a write after the home's death",
+];
+
+/// The signs that some course of a cell within these bounds must show.
+pub fn signs(bounds: &Bounds) -> impl Iterator<Item = &'static str> {
+    let [takeover, gap, told, revision, restarted] = SIGNS;
+    // A silence is a delay, and delays are in every cell. A cycle is missed between two that are not.
+    let can = [
+        (takeover, bounds.cycles > 0),
+        (gap, bounds.cycles > 2),
+        (told, !bounds.commands.is_empty()),
+        (revision, bounds.commands.contains(&2)),
+        (restarted, bounds.restarts > 0),
+    ];
+    can.into_iter().filter_map(|(sign, can)| can.then_some(sign))
+}
 
 impl Model for Cell {
     type State = State;
@@ -99,14 +126,22 @@ impl Model for Cell {
                 !state.acknowledged.contains(&asked) || state.desk.last().is_some_and(|record| record.revision == 2)
             }),
             // The faults that are allowed do happen, and so does what they lead to; else the rest would say nothing.
-            Property::sometimes("a takeover", |_, state: &State| {
-                state.writes.iter().any(|write| write.position.0 > 1)
+            Property::sometimes(SIGNS[0], |_, state: &State| {
+                // Members are asked in their order, so the first owner is the first host.
+                state.writes.iter().any(|write| write.by != host_id(0))
             }),
-            Property::sometimes("a cycle without a write", |_, state: &State| {
+            Property::sometimes(SIGNS[1], |_, state: &State| {
                 state
                     .writes
                     .windows(2)
                     .any(|pair| pair[1].position.1 > pair[0].position.1 + 1)
+            }),
+            Property::sometimes(SIGNS[2], |_, state: &State| !state.acknowledged.is_empty()),
+            Property::sometimes(SIGNS[3], |_, state: &State| {
+                state.desk.last().is_some_and(|record| record.revision == 2)
+            }),
+            Property::sometimes(SIGNS[4], |_, state: &State| {
+                state.writes.iter().any(|write| write.after_restart)
             }),
         ]
     }

@@ -135,7 +135,7 @@ pub struct Removal {
 }
 
 /// Each rule that can be taken away.
-pub const REMOVALS: [Removal; 5] = [
+pub const REMOVALS: [Removal; 7] = [
     Removal {
         what: "without terms",
         bounds: Bounds {
@@ -180,4 +180,36 @@ pub const REMOVALS: [Removal; 5] = [
         broken: Broken::ToldTooSoon,
         shows: RULES[3],
     },
+    Removal {
+        what: "the last record is given to nobody",
+        bounds: Bounds {
+            losses: 1,
+            crashes: 1,
+            ..QUIET
+        },
+        broken: Broken::NoResume,
+        shows: RULES[4],
+    },
+    Removal {
+        what: "a home that comes back with the first revision",
+        bounds: Bounds {
+            restarts: 1,
+            commands: &[2],
+            ..QUIET
+        },
+        broken: Broken::RevisionForgotten,
+        shows: RULES[5],
+    },
 ];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_rule_has_a_removal_that_shows_it() {
+        for rule in RULES {
+            assert!(REMOVALS.iter().any(|removal| removal.shows == rule), "{rule}");
+        }
+    }
+}

@@ -249,7 +249,10 @@ impl World {
     }
 
     fn dispatch(&mut self, number: u32, dispatch: Option<Dispatch>) {
-        let Some(Dispatch::Send(sample)) = dispatch else { return };
+        let Some(Dispatch::Send(mut sample)) = dispatch else {
+            return;
+        };
+        sample.resume.take_if(|_| self.broken() == Some(Broken::NoResume));
         let (home, owner) = (self.loops[number as usize].home, host_number(&sample.owner));
         if home == owner {
             self.sample(home, sample);
@@ -301,7 +304,7 @@ impl World {
                 let Some(owner) = desk.owner().cloned() else { return };
                 (record.term, record.owner) = (desk.term(), owner);
             }
-            (Some(Refusal::WrongBase), Some(Broken::AnyBase)) => {
+            (Some(Refusal::WrongBase), Some(Broken::AnyBase | Broken::Unchained)) => {
                 record.after = desk.last().map_or((0, 0), |last| last.position());
             }
             (Some(_), _) => return,

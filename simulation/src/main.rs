@@ -7,6 +7,7 @@ mod report;
 
 use std::{path::PathBuf, process::ExitCode, time::Instant};
 
+use bumpless_core::chatter;
 use bumpless_simulation::{Broken, Error, FaultKind, Plan, RULES, Schedule, World};
 use clap::Parser;
 
@@ -16,7 +17,7 @@ use crate::report::terminal::Report;
 const COURSE_LINES: usize = 60;
 /// Simulated time of one size of cell where messages are counted, in s.
 const SIZE_SECONDS: u64 = 20;
-/// By how much the messages of cycles may grow from the smallest cell to the largest: what a larger cell does differently is
+/// By how much the messages of cycles, and of all that hosts tell and ask each other besides, may grow from the smallest cell to the largest: what a larger cell does differently is
 /// that a loop's home is less often one of its replicas, so that a message more is sent.
 const GROWTH_MAX: f64 = 1.2;
 
@@ -30,11 +31,11 @@ struct Options {
     /// Loops.
     #[arg(long, default_value_t = 5_000)]
     loops: u32,
-    /// Kinds of faults: kill, pause, partition, loss, clock, disk, slow, bits; `none` for a calm cell.
+    /// Kinds of faults: kill, pause, partition, loss, saturation, clock, disk, slow, bits; `none` for a calm cell.
     #[arg(
         long,
         value_delimiter = ',',
-        default_value = "kill,pause,partition,loss,clock,disk,slow,bits"
+        default_value = "kill,pause,partition,loss,saturation,clock,disk,slow,bits"
     )]
     faults: Vec<String>,
     /// Faults per host and minute.
@@ -61,8 +62,8 @@ struct Options {
     /// Shows the course of this loop at the end.
     #[arg(long)]
     trace: Option<u32>,
-    /// Takes a rule away: no-terms, any-base, outputs-apart, terms-again, told-too-soon, first-answer; or `all`, one after the
-    /// other, each of which must be noticed.
+    /// Takes a rule away: no-terms, any-base, outputs-apart, terms-again, told-too-soon, first-answer, no-resume, unchained; or `all`, one
+    /// after the other, each of which must be noticed.
     #[arg(long)]
     broken: Option<String>,
     /// Cells of which the messages are counted, in hosts, with as many loops per host; none to leave it out.
@@ -277,7 +278,7 @@ fn broken_rules(plan: &Plan, seeds: u64, report: &mut Report) -> Result<(), Erro
 /// Counts the messages of calm cells of several sizes with as many loops per host.
 fn sizes(plan: &Plan, sizes: &[u32], report: &mut Report) -> Result<(), Error> {
     let per_host = (plan.loops / plan.hosts.max(1)).max(1);
-    let mut of_cycles = Vec::new();
+    let (mut of_cycles, mut of_all) = (Vec::new(), Vec::new());
     for hosts in sizes {
         let mut world = World::new(Plan {
             hosts: *hosts,
@@ -292,9 +293,12 @@ fn sizes(plan: &Plan, sizes: &[u32], report: &mut Report) -> Result<(), Error> {
         })?;
         world.run();
         let counts = world.counts();
+        let chatter_per_s = chatter::received_per_s(*hosts as usize);
         let rate = |n: u64| n as f64 / f64::from(*hosts) / (SIZE_SECONDS + 1) as f64;
         let name = |what: &str| format!("{hosts} hosts, {per_host} loops each: {what} per host and second");
-        of_cycles.push(rate(counts.messages.all()));
+        let cycles_per_s = rate(counts.messages.all());
+        of_cycles.push(cycles_per_s);
+        of_all.push(cycles_per_s + chatter_per_s);
         report.told(&name("messages of cycles"), rate(counts.messages.all()), "1/s");
         report.told(&name("samples"), rate(counts.messages.samples), "1/s");
         report.told(&name("answers"), rate(counts.messages.answers), "1/s");
@@ -305,17 +309,20 @@ fn sizes(plan: &Plan, sizes: &[u32], report: &mut Report) -> Result<(), Error> {
             rate(counts.feed_copies),
             "1/s",
         );
-        // Vitals five times a second to every other host; a probe ten times a second to each, and its answer.
-        let others = f64::from(hosts.saturating_sub(1));
-        report.told(&name("vitals and probes"), others * (5.0 + 2.0 * 10.0), "1/s");
+        report.told(&name("vitals, standings and probes"), chatter_per_s, "1/s");
     }
-    if let (Some(first), Some(last)) = (of_cycles.first(), of_cycles.last()) {
-        report.at_most(
-            "messages of cycles per host, largest cell over smallest",
-            last / first,
-            "",
-            GROWTH_MAX,
-        );
+    for (what, rates) in [
+        ("messages of cycles", of_cycles),
+        ("messages of cycles, vitals, standings and probes", of_all),
+    ] {
+        if let (Some(first), Some(last)) = (rates.first(), rates.last()) {
+            report.at_most(
+                &format!("{what} per host, largest cell over smallest"),
+                last / first,
+                "",
+                GROWTH_MAX,
+            );
+        }
     }
     Ok(())
 }

@@ -4,7 +4,7 @@
 //!
 //! ```toml
 //! [[fault]]
-//! kind = "pause"       # kill, pause, partition, loss, clock, disk, slow, bits
+//! kind = "pause"       # kill, pause, partition, loss, saturation, clock, disk, slow, bits
 //! at_ms = 2000
 //! for_ms = 500
 //! hosts = [3]          # for a partition: those on one side
@@ -40,6 +40,8 @@ pub enum FaultKind {
     Partition,
     /// A host's links lose, repeat and delay messages.
     Loss,
+    /// A host's links carry few messages: they queue, and what finds no room is dropped.
+    Saturation,
     /// A host restarts with a clock that is hours away from what it was.
     Clock,
     /// A host's disk takes no more writes.
@@ -52,11 +54,12 @@ pub enum FaultKind {
 
 impl FaultKind {
     /// All of them.
-    pub const ALL: [Self; 8] = [
+    pub const ALL: [Self; 9] = [
         Self::Kill,
         Self::Pause,
         Self::Partition,
         Self::Loss,
+        Self::Saturation,
         Self::Clock,
         Self::Disk,
         Self::Slow,
@@ -71,6 +74,7 @@ impl FaultKind {
             Self::Pause => "pause",
             Self::Partition => "partition",
             Self::Loss => "loss",
+            Self::Saturation => "saturation",
             Self::Clock => "clock",
             Self::Disk => "disk",
             Self::Slow => "slow",
@@ -150,17 +154,23 @@ pub enum Broken {
     ToldTooSoon,
     /// A vote takes the first answer.
     FirstAnswer,
+    /// Whoever asks for the last record, or takes over, does not get it.
+    NoResume,
+    /// Owners do not say which record theirs goes on from, and the home does not ask.
+    Unchained,
 }
 
 impl Broken {
     /// All of them.
-    pub const ALL: [Self; 6] = [
+    pub const ALL: [Self; 8] = [
         Self::NoTerms,
         Self::AnyBase,
         Self::OutputsApart,
         Self::TermsAgain,
         Self::ToldTooSoon,
         Self::FirstAnswer,
+        Self::NoResume,
+        Self::Unchained,
     ];
 
     /// The word for it.
@@ -173,6 +183,8 @@ impl Broken {
             Self::TermsAgain => "terms-again",
             Self::ToldTooSoon => "told-too-soon",
             Self::FirstAnswer => "first-answer",
+            Self::NoResume => "no-resume",
+            Self::Unchained => "unchained",
         }
     }
 }
@@ -316,7 +328,9 @@ impl Plan {
                 FaultKind::Pause => random.spread(MS, 60_000 * MS) / MS,
                 FaultKind::Kill | FaultKind::Clock => random.spread(50, 20_000),
                 FaultKind::Partition => random.spread(20, 30_000),
-                FaultKind::Loss | FaultKind::Disk | FaultKind::Slow | FaultKind::Bits => random.spread(100, 20_000),
+                FaultKind::Loss | FaultKind::Saturation | FaultKind::Disk | FaultKind::Slow | FaultKind::Bits => {
+                    random.spread(100, 20_000)
+                }
             };
             let host = random.between(0, u64::from(self.hosts)) as u32;
             let mut hosts = vec![host];

@@ -162,8 +162,9 @@ impl World {
             hedge_ns,
         };
         match (running.standing.revise, ballot) {
-            (Some(_), _) => self.revise(host, number, running),
-            (None, Some(ballot)) => self.open_ballot(host, number, running, ballot),
+            (Some(_), None) => self.revise(host, number, running),
+            // A change is voted on like any other step.
+            (_, Some(ballot)) => self.open_ballot(host, number, running, ballot),
             (None, None) => self.advance(host, number, running),
         }
     }
@@ -192,10 +193,16 @@ impl World {
 
     /// A change of revision: both sides of it step here. The law is the same, so no output moves.
     fn revise(&mut self, host: u32, number: u32, mut running: Running) {
+        self.go_over(number, &mut running);
+        let effects = law::step(&running.state);
+        self.conclude(host, number, running, Ok(effects), host);
+    }
+
+    /// Goes on under the revision that was asked for, if one was.
+    fn go_over(&self, number: u32, running: &mut Running) {
         let Some((command, revision)) = running.standing.revise else {
             return;
         };
-        let effects = law::step(&running.state);
         match self.spec(number, revision) {
             Some(next) => {
                 running.standing.remember(command, Outcome::Done);
@@ -211,7 +218,6 @@ impl World {
                 .standing
                 .remember(command, Outcome::Refused("not known".to_owned())),
         }
-        self.conclude(host, number, running, Ok(effects), host);
     }
 
     fn request(&mut self, host: u32, number: u32, running: &mut Running, to: u32) {
@@ -231,6 +237,8 @@ impl World {
             limit_ns: running.spec.step_limit_ns(),
             frame: running.frame.clone(),
             state: Arc::clone(&running.state),
+            // The law is the same on both sides of a change.
+            switch: None,
         };
         self.send(host, to, Message::Step(Box::new(request)));
     }
@@ -435,9 +443,16 @@ impl World {
         running.redundancy.vote = Some(standing);
         running.events.extend(news);
         match closed.decided {
-            Cast::Effects(effects) => self.conclude(host, number, running, Ok(effects), host),
+            Cast::Effects(effects) => {
+                self.go_over(number, &mut running);
+                self.conclude(host, number, running, Ok(effects), host);
+            }
             _ => {
                 self.counts.no_majority += 1;
+                if let Some((command, _)) = running.standing.revise {
+                    let refused = Outcome::Refused("no majority".to_owned());
+                    running.standing.remember(command, refused);
+                }
                 self.without_a_step(host, number, running, "no majority");
             }
         }
@@ -449,7 +464,7 @@ impl World {
         let step_ns = self.step_ns(host);
         let probation = swap::probation_after(running.base.as_deref());
         let home = host_number(&running.sample.home);
-        let record = seat::conclude(Conclusion {
+        let mut record = seat::conclude(Conclusion {
             owner: &me,
             sample: &running.sample,
             base: running.base.as_deref(),
@@ -468,6 +483,9 @@ impl World {
             }),
             cycle_ns: now_ns.saturating_sub(running.started_ns),
         });
+        if self.broken() == Some(Broken::Unchained) {
+            record.after = (0, 0);
+        }
         if home != host
             && let Some(seat) = self.host_mut(host).seats.get_mut(&number)
         {

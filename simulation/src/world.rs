@@ -242,7 +242,7 @@ impl World {
             return;
         }
         let delay_ns = if self.host(from).slow > 0 { 1_000_000 } else { 0 };
-        let [first, again] = self.network.ways(from, to);
+        let [first, again] = self.network.ways(from, to, self.now_ns);
         if let Some(ns) = again {
             let message = message.clone();
             self.queue
@@ -359,6 +359,7 @@ impl World {
                     }
                 }
                 FaultKind::Loss => self.network.spoil(*host, true),
+                FaultKind::Saturation => self.network.saturate(*host, true),
                 FaultKind::Disk => self.host_mut(*host).disk_full += 1,
                 FaultKind::Slow => self.host_mut(*host).slow += 1,
                 FaultKind::Bits => self.host_mut(*host).bits += 1,
@@ -389,6 +390,7 @@ impl World {
                 FaultKind::Kill | FaultKind::Clock => self.start(*host),
                 FaultKind::Pause => self.go_on(*host),
                 FaultKind::Loss => self.network.spoil(*host, false),
+                FaultKind::Saturation => self.network.saturate(*host, false),
                 FaultKind::Disk => self.host_mut(*host).disk_full -= 1,
                 FaultKind::Slow => self.host_mut(*host).slow -= 1,
                 FaultKind::Bits => self.host_mut(*host).bits -= 1,

@@ -3,12 +3,12 @@
 use std::time::Duration;
 
 use bumpless_tests::{
-    Cell, CellOptions, Inflictor, Kind, Observer, Operator, Outcome, Profile, Schedule, first_order_loop,
+    Cell, CellOptions, Inflictor, Kind, Observer, Operator, Outcome, Profile, Schedule, Way, first_order_loop,
     kept_commands, unix_ns,
 };
-use serde_json::json;
+use serde_json::{Value, json};
 
-use crate::one_writer;
+use crate::{names, one_writer, whole};
 
 const LOOPS: usize = 4;
 
@@ -37,7 +37,14 @@ fn faults_of_many_kinds_break_no_promise() {
         half: Duration::from_secs(1),
     };
     let operator = Operator::start(&addresses, &names, profile).unwrap();
-    let kinds = [Kind::Pause, Kind::CutOneWay, Kind::Kill, Kind::Date, Kind::HomeKill];
+    let kinds = [
+        Kind::Pause,
+        Kind::CutOneWay,
+        Kind::Narrow,
+        Kind::Kill,
+        Kind::Date,
+        Kind::HomeKill,
+    ];
     for fault in Schedule::new(5, &kinds, 300, (50, 200)).take(kinds.len()) {
         inflictor
             .inflict(&fault)
@@ -66,4 +73,60 @@ fn faults_of_many_kinds_break_no_promise() {
         let writes = journal.between(&format!("plant.{n}.out"), started_ns, unix_ns()).len();
         assert!(writes > 20, "loop {n} wrote {writes} times");
     }
+}
+
+fn told(record: &Value, kinds: &[&str]) -> bool {
+    let events = record["events"].as_array().map(Vec::as_slice).unwrap_or_default();
+    events
+        .iter()
+        .any(|event| kinds.iter().any(|kind| event["kind"] == *kind))
+}
+
+#[test]
+fn a_loop_whose_link_carries_too_little_goes_on_and_says_so() {
+    let options = CellOptions {
+        relayed: Some("a".to_owned()),
+        ..CellOptions::first_order("{ count = 1, tau_s = 1.0 }")
+    };
+    let mut cell = Cell::start(options).unwrap();
+    let api = cell.api().unwrap();
+    api.upload_stock(&["pid"]).unwrap();
+    let mut draft = first_order_loop(0, "pid", 50.0);
+    draft["prefer"] = json!(["a"]);
+    api.apply(&draft).unwrap();
+    api.wait_for_loop("loop-0", "the host behind the relay to own it", |view| {
+        view["owner"] == "a" && names(&view["members"]).len() == 3
+    })
+    .unwrap();
+    let feed = api.live("?loops=loop-0").unwrap();
+    feed.record_where("a cycle of its owner", |record| record["owner"] == "a")
+        .unwrap();
+
+    // A sample and a commit each have some hundred bytes, twenty times a second.
+    let relay = cell.relay.as_ref().unwrap();
+    for way in [Way::Away, Way::Back] {
+        relay.narrow(way, Some(1_000));
+    }
+    let taken = feed
+        .record_where("a cycle that somebody else runs", |record| record["owner"] != "a")
+        .unwrap();
+    assert!(told(&taken, &["took-over"]), "it says so: {}", taken["events"]);
+    let from = whole(&taken["seq"]);
+    let later = feed
+        .record_where("two seconds more", |record| record["seq"].as_u64() > Some(from + 40))
+        .unwrap();
+    assert_ne!(later["stepped_by"], "a", "nobody waits for the narrow link");
+    let lost = whole(&api.loop_view("loop-0").unwrap()["tally"]["lost"]);
+
+    let relay = cell.relay.as_ref().unwrap();
+    for way in [Way::Away, Way::Back] {
+        relay.narrow(way, None);
+    }
+    feed.record_where("a step of the host whose link is wide again", |record| {
+        record["stepped_by"] == "a"
+    })
+    .unwrap();
+    let journal = cell.journal().unwrap();
+    one_writer(&journal);
+    assert!(lost < 20, "a takeover, and not a standstill: {lost} cycles lost");
 }

@@ -115,6 +115,15 @@ const CONFINED: [(&str, &[&str]); 14] = [
     ),
 ];
 
+/// Where a host's program reads the date: once at its start, for what people read; and in the command line's own answers. A date
+/// that is set while hosts run can matter nowhere else.
+const DATES: [&str; 4] = [
+    "host/io/src/clock.rs",
+    "host/api/src/notices.rs",
+    "host/app/src/commands/components.rs",
+    "host/app/src/commands/io.rs",
+];
+
 /// Where `unsafe` is: the loading of compiled code, one system call, and the canonical ABI of guests.
 const UNSAFE: [&str; 8] = [
     "host/app/src/realtime.rs",
@@ -250,6 +259,23 @@ fn unsafe_code_is_where_it_must_be_and_says_why_it_is_sound() {
         }
     }
     none("unsafe code", &found);
+}
+
+#[test]
+fn the_date_is_read_where_it_is_for_people() {
+    let program = |path: &str| path.starts_with("host/") && path.contains("/src/") && !path.contains("/tests");
+    let readers: Vec<String> = sources()
+        .into_iter()
+        .filter(|(path, text)| program(path) && text.contains("SystemTime::now"))
+        .map(|(path, _)| path)
+        .collect();
+    let others: Vec<String> = readers
+        .iter()
+        .filter(|path| !DATES.contains(&path.as_str()))
+        .cloned()
+        .collect();
+    none("the date is read", &others);
+    assert_eq!(readers.len(), DATES.len(), "{readers:?}");
 }
 
 #[test]

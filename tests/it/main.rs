@@ -10,6 +10,7 @@
 //! | door | jobs over the bus, by a program that is no host |
 //! | masters | two hosts for one device |
 //! | members | frozen owners, late hosts, hosts that leave |
+//! | clocks | dates that are apart, that step, that went back |
 //! | drain | hosts that are emptied, restarted one by one, preferred, cut off |
 //! | chaos | faults by a seed, under the checker |
 //! | history | replays, backtests, shadows |
@@ -41,6 +42,7 @@ mod api;
 mod calls;
 mod changes;
 mod chaos;
+mod clocks;
 mod commissioning;
 mod door;
 mod drain;

@@ -5,7 +5,7 @@ use std::{collections::BTreeMap, net::SocketAddr, path::Path, sync::Arc, time::D
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-use crate::{Api, Disk, Error, HostOptions, HostProcess, Journal, Net, Relay, slots::Slot, wait_until};
+use crate::{Api, Disk, Error, HostOptions, HostProcess, Journal, Net, Relay, chaos::dates, slots::Slot, wait_until};
 
 /// Name of the host with the plant.
 pub const PLANT: &str = "plant";
@@ -40,6 +40,8 @@ pub struct CellOptions {
     pub net: Option<Arc<Net>>,
     /// Hosts whose data lies on a small disk of their own, with its bytes.
     pub disks: Vec<(String, u64)>,
+    /// Dates that can be stepped while hosts run, where there is a means for it; see [`Cell::dates`].
+    pub dates: bool,
     /// The controller host whose link with the plant passes a relay.
     pub relayed: Option<String>,
 }
@@ -58,6 +60,7 @@ impl Default for CellOptions {
             heads: Vec::new(),
             net: None,
             disks: Vec::new(),
+            dates: false,
             relayed: None,
         }
     }
@@ -126,7 +129,7 @@ impl Cell {
         }
         let plant_options = HostOptions {
             tables: format!("{}\n{}", options.bus, options.plant_tables),
-            ..host_options(&options, &name, PLANT)
+            ..host_options(&options, &name, PLANT, folder.path())?
         };
         let plant = HostProcess::start(plant_options, &folder.path().join(PLANT))?;
         let relay = options
@@ -165,7 +168,7 @@ impl Cell {
         let options = HostOptions {
             connect: self.locators(name),
             tables: format!("{}\n{own}", self.options.controller_tables),
-            ..host_options(&self.options, &self.name, name)
+            ..host_options(&self.options, &self.name, name, self.folder.path())?
         };
         HostProcess::spawn(options, &self.folder.path().join(name))
     }
@@ -196,6 +199,12 @@ impl Cell {
             }
         }
         known
+    }
+
+    /// Can the hosts' dates be stepped? They were asked for, and libfaketime is here.
+    #[must_use]
+    pub fn dates(&self) -> bool {
+        self.options.dates && dates::library().is_some()
     }
 
     /// The namespaces that the hosts run in.
@@ -302,7 +311,7 @@ impl Cell {
 }
 
 /// What all hosts have in common.
-fn host_options(options: &CellOptions, cell: &str, name: &str) -> HostOptions {
+fn host_options(options: &CellOptions, cell: &str, name: &str, folder: &Path) -> Result<HostOptions, Error> {
     let number = host_number(name);
     let head = options.heads.iter().find(|(host, _)| host == name);
     let mut common = HostOptions {
@@ -313,13 +322,16 @@ fn host_options(options: &CellOptions, cell: &str, name: &str) -> HostOptions {
         head: head.map(|(_, keys)| keys.clone()).unwrap_or_default(),
         ..HostOptions::default()
     };
+    if let Some(library) = dates::library().filter(|_| options.dates) {
+        common.environment = dates::prepare(&library, &folder.join(name))?;
+    }
     if let Some(net) = &options.net {
         let address = net.address(number);
         common.listen = vec![format!("tcp/{address}:0")];
         common.api_listen = format!("{address}:0");
         common.launcher = net.launcher(number).into_iter().chain(common.launcher).collect();
     }
-    common
+    Ok(common)
 }
 
 /// Place of a host in a net: the plant first, then the controllers by their letters.

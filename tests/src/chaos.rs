@@ -1,7 +1,7 @@
 //! Faults on purpose: what is inflicted and when, by which means, and whether the promises held.
 //!
 //! ```text
-//!   Schedule (seeded) ──fault──► Inflictor ──kill, stop, cut, delay, fill, move the date──► Cell of processes
+//!   Schedule (seeded) ──fault──► Inflictor ──kill, stop, cut, delay, fill, set the date──►  Cell of processes
 //!                                                                                             │
 //!   Operator ──setpoints, each with its key──► API of any host                                │
 //!      └── what was acknowledged ──┐                     journal, records ◄──── Observer ◄────┘
@@ -11,6 +11,7 @@
 //! ends. Never: looks inside a host.
 
 mod check;
+pub(crate) mod dates;
 mod disk;
 mod inflictor;
 mod net;

@@ -22,7 +22,7 @@ use std::{
 use rustix::process::{Pid, Signal, kill_process};
 use serde::Deserialize;
 
-use crate::{Api, Binary, Error, Watchdog, journal, wait_until};
+use crate::{Api, Binary, Error, Watchdog, chaos::dates, journal, wait_until};
 
 /// Longest time until a host is ready: it opens its store, finds the others and compiles what it must hold.
 const READY_MAX: Duration = Duration::from_secs(30);
@@ -256,6 +256,14 @@ impl HostProcess {
     /// Keys before the tables of its configuration, from the next start on.
     pub fn set_head(&mut self, head: String) {
         self.options.head = head;
+    }
+
+    /// Sets its date so many seconds off while it runs; only where its cell has [`crate::CellOptions::dates`].
+    ///
+    /// # Errors
+    /// [`Error::File`].
+    pub fn step_date(&self, by_s: i64) -> Result<(), Error> {
+        dates::step(&self.folder, by_s)
     }
 
     /// Its client.

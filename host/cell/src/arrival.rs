@@ -69,8 +69,8 @@ pub enum Arrival {
         /// Takes the reply.
         responder: Responder,
     },
-    /// An older process of the cell has this host's name. It could not be seen when this one joined. This host's token is
-    /// taken back; it must stop.
+    /// A process that joined the cell before has this host's name. It could not be seen when this one joined. This host's token
+    /// is taken back; it must stop.
     NameTaken {
         /// The other's instance.
         instance: String,

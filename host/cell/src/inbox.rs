@@ -1,13 +1,10 @@
 //! Everything that comes in: messages, tokens and requests become arrivals, or are counted as malformed.
 //!
-//! Owns: the reading of what others sent, membership, the limit on reports. Never: panics on what others sent; keeps the
+//! Owns: the reading of what others sent, membership, claims to the name, the limit on reports. Never: panics on what others sent; keeps the
 //! session alive (it holds it weakly).
 
 use std::{
-    sync::{
-        Arc, OnceLock, Weak,
-        atomic::{AtomicBool, AtomicUsize, Ordering},
-    },
+    sync::{Arc, OnceLock, Weak, atomic::AtomicUsize},
     time::{Duration, Instant},
 };
 
@@ -21,6 +18,7 @@ use zenoh::{
 
 use crate::{
     arrival::{Arrival, Sink},
+    claims::{Claim, Claims},
     counters::{Tally, count},
     error::{Error, cut},
     keys::{Instance, Key, Keys, Lane},
@@ -31,14 +29,18 @@ use crate::{
     wire,
 };
 
+/// How often namesakes say how long they have been here.
+const CLAIM_EVERY: Duration = Duration::from_millis(200);
+
 pub(crate) struct Inbox {
     pub(crate) keys: Keys,
     pub(crate) host: HostId,
     pub(crate) instance: Instance,
     pub(crate) tally: Tally,
     pub(crate) shared: OnceLock<Weak<Shared>>,
-    /// Set once this host's own token is out: from then on an older namesake is a conflict.
-    pub(crate) joined: AtomicBool,
+    /// Since when this host's own token is out: from then on a namesake is a conflict.
+    joined_at: OnceLock<Instant>,
+    claims: Mutex<Claims>,
     sink: Sink,
     pub(crate) runtime: Handle,
     in_flight: Arc<AtomicUsize>,
@@ -57,7 +59,8 @@ impl Inbox {
             instance,
             tally: Tally::default(),
             shared: OnceLock::new(),
-            joined: AtomicBool::new(false),
+            joined_at: OnceLock::new(),
+            claims: Mutex::default(),
             sink,
             runtime,
             in_flight: Arc::default(),
@@ -94,6 +97,8 @@ impl Inbox {
         if host == self.host {
             if appears {
                 self.on_namesake(&instance);
+            } else {
+                self.claims.lock().vanish(&instance);
             }
             return;
         }
@@ -121,19 +126,67 @@ impl Inbox {
         drop(order);
     }
 
-    /// Another process has this host's name. The younger gives way; before the token is out, opening sees to it.
-    fn on_namesake(&self, other: &Instance) {
-        if *other == self.instance || !self.joined.load(Ordering::Acquire) {
+    /// This host's token is out.
+    pub(crate) fn joined(&self) {
+        // Set once, by whoever put it out.
+        let _ = self.joined_at.set(Instant::now());
+    }
+
+    /// Another process has this host's name: both say how long they have been here, until one of them leaves. Before the token
+    /// is out, opening sees to it.
+    pub(crate) fn on_namesake(&self, other: &Instance) {
+        if *other == self.instance || self.joined_at.get().is_none() || !self.claims.lock().appear(other) {
             return;
         }
-        if *other > self.instance {
-            tracing::warn!(host = %self.host, instance = other.as_str(), "a younger host of this name joined; it will leave");
+        tracing::warn!(host = %self.host, instance = other.as_str(), "another host of this name is here; the one that joined later will leave");
+        let Some(shared) = self.shared.get().cloned() else {
             return;
+        };
+        drop(self.runtime.spawn(async move {
+            let mut beat = tokio::time::interval(CLAIM_EVERY);
+            loop {
+                beat.tick().await;
+                let Some(shared) = shared.upgrade().filter(|shared| shared.say_claim()) else {
+                    return;
+                };
+                drop(shared);
+            }
+        }));
+    }
+
+    /// This host's claim, while there is somebody to say it to.
+    pub(crate) fn claim(&self) -> Option<Claim> {
+        let joined_for_us = self.joined_for_us()?;
+        self.claims.lock().speak().then(|| Claim {
+            instance: self.instance.clone(),
+            joined_for_us,
+        })
+    }
+
+    fn joined_for_us(&self) -> Option<u64> {
+        let joined_at = self.joined_at.get()?;
+        Some(u64::try_from(joined_at.elapsed().as_micros()).unwrap_or(u64::MAX))
+    }
+
+    /// A namesake says how long it has been here.
+    pub(crate) fn on_claim(&self, put: &Put) {
+        let payload = put.payload();
+        let claim = wire::fits::<Claim>(payload.len()).and_then(|()| wire::decode::<Claim>(&payload.to_bytes()));
+        let claim = match claim {
+            Ok(claim) => claim,
+            Err(error) => return self.malformed(put.key_expr().as_str(), &error),
+        };
+        // Its token may come later.
+        self.on_namesake(&claim.instance);
+        let Some(joined_for_us) = self.joined_for_us() else {
+            return;
+        };
+        if self.claims.lock().hear(&self.instance, joined_for_us, &claim) {
+            self.in_background(self.host.clone(), |shared, _| shared.take_back_token());
+            (self.sink)(Arrival::NameTaken {
+                instance: claim.instance.as_str().to_owned(),
+            });
         }
-        self.in_background(self.host.clone(), |shared, _| shared.take_back_token());
-        (self.sink)(Arrival::NameTaken {
-            instance: other.as_str().to_owned(),
-        });
     }
 
     /// A query for this host.
@@ -326,7 +379,7 @@ fn read<'a>(
             bytes: len,
             limit: NOTICE_BYTES_MAX,
         }),
-        Key::Request { .. } | Key::Alive(..) => Err(Error::Key {
+        Key::Request { .. } | Key::Alive(..) | Key::Claim(_) => Err(Error::Key {
             key: cut(key, REPORTED_KEY_CHARS_MAX),
             reason: "it carries no messages",
         }),

@@ -8,6 +8,7 @@
 //! bumpless/<cell>/record/<loop>               what the arbiter took, to all who listen
 //! bumpless/<cell>/vitals/<host>               how a host is
 //! bumpless/<cell>/notice/<host>               something changed at a host
+//! bumpless/<cell>/claim/<host>                what hosts of one name say to each other
 //! bumpless/<cell>/alive/<host>/<instance>     liveliness token of one life of a host
 //! bumpless/<cell>/open/<door>/<host>          what programs that are no hosts may ask (see `door`)
 //! ```
@@ -16,6 +17,7 @@
 //! no bytes in the message. Names hold no character that means something in a key expression.
 
 use bumpless_core::{CellName, HostId, LoopId};
+use serde::{Deserialize, Serialize};
 
 use crate::error::{Error, cut};
 use crate::limits::REPORTED_KEY_CHARS_MAX;
@@ -69,20 +71,26 @@ impl Lane {
     }
 }
 
-/// One life of a host: start time in µs and a random number, both in hexadecimal. The older of two sorts first.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
+/// One life of a host: 128 random bits in hexadecimal. The order of two says nothing of their age: a start's date would need clocks
+/// that agree.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct Instance(String);
 
 impl Instance {
-    /// From the time in µs of Unix time, and any number that no other process draws.
+    /// From two numbers that no other process draws.
     #[must_use]
-    pub fn new(started_at_us: u64, random: u64) -> Self {
-        Self(format!("{started_at_us:016x}{random:016x}"))
+    pub fn new(high: u64, low: u64) -> Self {
+        Self(format!("{high:016x}{low:016x}"))
     }
 
     fn parse(text: &str) -> Option<Self> {
-        let digits = text.bytes().all(|b| b.is_ascii_digit() || (b'a'..=b'f').contains(&b));
-        (text.len() == 32 && digits).then(|| Self(text.to_owned()))
+        Some(Self(text.to_owned())).filter(Self::is_sound)
+    }
+
+    /// Is it one, where it came from outside?
+    pub(crate) fn is_sound(&self) -> bool {
+        let digits = self.0.bytes().all(|b| b.is_ascii_digit() || (b'a'..=b'f').contains(&b));
+        self.0.len() == 32 && digits
     }
 
     /// As text: 32 hexadecimal digits.
@@ -117,6 +125,8 @@ pub enum Key {
     Vitals(HostId),
     /// The notices of a host.
     Notice(HostId),
+    /// What hosts of this name say to each other.
+    Claim(HostId),
     /// The token of one life of a host.
     Alive(HostId, Instance),
 }
@@ -144,6 +154,7 @@ impl Keys {
             Key::Record(id) => format!("{PREFIX}/{cell}/record/{id}"),
             Key::Vitals(host) => format!("{PREFIX}/{cell}/vitals/{host}"),
             Key::Notice(host) => format!("{PREFIX}/{cell}/notice/{host}"),
+            Key::Claim(host) => format!("{PREFIX}/{cell}/claim/{host}"),
             Key::Alive(host, instance) => format!("{PREFIX}/{cell}/alive/{host}/{}", instance.0),
         }
     }
@@ -194,6 +205,7 @@ impl Keys {
             "record" => Key::Record(LoopId::new(next()?).map_err(|_| "the loop's name is no name")?),
             "vitals" => Key::Vitals(host(next()?)?),
             "notice" => Key::Notice(host(next()?)?),
+            "claim" => Key::Claim(host(next()?)?),
             "alive" => {
                 let id = host(next()?)?;
                 Key::Alive(
@@ -278,6 +290,7 @@ mod tests {
             "[a-z0-9_-][a-z0-9_.-]{0,63}".prop_map(|text| Key::Record(LoopId::new(text).unwrap())),
             host().prop_map(Key::Vitals),
             host().prop_map(Key::Notice),
+            host().prop_map(Key::Claim),
             (host(), any::<u64>(), any::<u64>()).prop_map(|(id, at, r)| Key::Alive(id, Instance::new(at, r))),
         ]
     }
@@ -365,10 +378,5 @@ mod tests {
             let error = keys().parse(text).expect_err(text).to_string();
             assert!(error.contains(reason), "{text}: {error}");
         }
-    }
-
-    #[test]
-    fn the_older_instance_sorts_first() {
-        assert!(Instance::new(1, u64::MAX) < Instance::new(2, 0));
     }
 }

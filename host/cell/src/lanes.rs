@@ -6,7 +6,7 @@
 //! lane                              priority     when the link is full
 //! sample answer step … ping pong    real time    drop: the cycle's deadline copes
 //! record                            real time    drop: in one queue with the samples, so that a record is not overtaken
-//! vitals notice                     data high    drop: the next one says more
+//! vitals notice claim               data high    drop: the next one says more
 //! request and reply                 data low     block, on a thread that may wait
 //! ```
 //!
@@ -65,6 +65,7 @@ pub(crate) struct Lanes {
     declaring: Mutex<()>,
     vitals: Publisher<'static>,
     notice: Publisher<'static>,
+    claim: Publisher<'static>,
 }
 
 impl Lanes {
@@ -73,6 +74,7 @@ impl Lanes {
         Ok(Self {
             vitals: news(Key::Vitals(host.clone()))?,
             notice: news(Key::Notice(host.clone()))?,
+            claim: news(Key::Claim(host.clone()))?,
             keys,
             host,
             hosts: RwLock::default(),
@@ -98,6 +100,10 @@ impl Lanes {
 
     pub(crate) fn notice(&self, bytes: Vec<u8>) -> Result<(), Error> {
         put(&self.notice, "notice", bytes)
+    }
+
+    pub(crate) fn claim(&self, bytes: Vec<u8>) -> Result<(), Error> {
+        put(&self.claim, "claim to a name", bytes)
     }
 
     /// Declares the lanes to a host, so that no cycle has to.

@@ -6,17 +6,21 @@
 //!          token                       last token gone
 //! absent ────────► present(instance) ─────────────────► absent
 //!                   │        ▲
-//!                   └────────┘ oldest token gone, a younger one left: Down, then Up
+//!                   └────────┘ first token gone, a later one left: Down, then Up
 //! ```
 //!
-//! Two tokens of one name are a restart within the lease, or a namesake that is about to leave. The older counts until it
-//! goes: a restart is told once the old life is over, and a namesake disturbs nobody.
+//! Two tokens of one name are a restart within the lease, or a namesake that is about to leave. The one that came first counts
+//! until it goes: a restart is told once the old life is over, and a namesake disturbs nobody. No clock says which came first;
+//! each host goes by what it saw.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
 use bumpless_core::HostId;
 
 use crate::keys::Instance;
+
+/// Tokens of one name that are remembered: more are no restart, and the first counts in any case.
+const LIVES_MAX: usize = 16;
 
 /// What a change of tokens means.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -28,21 +32,24 @@ pub(crate) enum Change {
 /// The tokens that are there.
 #[derive(Debug, Default)]
 pub(crate) struct Members {
-    lives: BTreeMap<HostId, BTreeSet<Instance>>,
+    /// Each host's, in the order in which they came. A host has one or two.
+    lives: BTreeMap<HostId, Vec<Instance>>,
 }
 
 impl Members {
     /// A token came.
     pub(crate) fn appear(&mut self, host: &HostId, instance: Instance) -> Vec<Change> {
         self.change(host, |lives| {
-            lives.insert(instance);
+            if !lives.contains(&instance) && lives.len() < LIVES_MAX {
+                lives.push(instance);
+            }
         })
     }
 
     /// A token went.
     pub(crate) fn vanish(&mut self, host: &HostId, instance: &Instance) -> Vec<Change> {
         self.change(host, |lives| {
-            lives.remove(instance);
+            lives.retain(|life| life != instance);
         })
     }
 
@@ -51,7 +58,7 @@ impl Members {
         self.lives.keys().cloned().collect()
     }
 
-    fn change(&mut self, host: &HostId, edit: impl FnOnce(&mut BTreeSet<Instance>)) -> Vec<Change> {
+    fn change(&mut self, host: &HostId, edit: impl FnOnce(&mut Vec<Instance>)) -> Vec<Change> {
         let lives = self.lives.entry(host.clone()).or_default();
         let before = lives.first().cloned();
         edit(lives);
@@ -78,7 +85,8 @@ mod tests {
     fn comings_and_goings() {
         let host = HostId::new("a").unwrap();
         let (up, down) = (Change::Up(host.clone()), Change::Down(host.clone()));
-        let (first, second) = (Instance::new(1, 7), Instance::new(2, 3));
+        // Whatever their numbers: the second sorts first.
+        let (first, second) = (Instance::new(2, 7), Instance::new(1, 3));
         let mut members = Members::default();
         assert_eq!(members.appear(&host, first.clone()), vec![up.clone()]);
         assert_eq!(members.appear(&host, first.clone()), [], "a token that is repeated");
@@ -92,9 +100,9 @@ mod tests {
         members.appear(&host, second.clone());
         assert_eq!(members.vanish(&host, &first), [down.clone(), up.clone()], "a restart");
         assert_eq!(members.vanish(&host, &first), [], "a token that went before");
-        // A frozen life that goes on is the older one again.
-        assert_eq!(members.appear(&host, first.clone()), [down.clone(), up]);
-        assert_eq!(members.vanish(&host, &second), []);
+        // A frozen life that goes on came later, and counts when it is the one that is left.
+        assert_eq!(members.appear(&host, first.clone()), []);
+        assert_eq!(members.vanish(&host, &second), [down.clone(), up]);
         assert_eq!(members.vanish(&host, &first), [down]);
         assert!(members.hosts().is_empty());
     }

@@ -6,7 +6,7 @@
 //! open ─► connected ─► name free? ──no, after lease + 500 ms──► Err(NameTaken)
 //!                          │ yes
 //!                          ▼
-//!                       joined ───── an older namesake shows up ─────► Arrival::NameTaken, token taken back
+//!                       joined ── a namesake that joined before ─────► Arrival::NameTaken, token taken back
 //!                          │
 //!                 close, or last clone dropped ─► closed: sends fail and are counted
 //! ```
@@ -14,10 +14,9 @@
 use std::{
     sync::{
         Arc,
-        atomic::Ordering,
         mpsc::{RecvTimeoutError, channel},
     },
-    time::{Duration, Instant, SystemTime, UNIX_EPOCH},
+    time::{Duration, Instant},
 };
 
 use bumpless_core::{
@@ -114,16 +113,16 @@ impl Session {
         session.shared.listen(&keys)?;
         session.shared.wait_for_name(config)?;
         session.shared.put_out_token(&keys)?;
-        // Two that looked at the same moment did not see each other: look again, and the younger leaves.
-        match session
-            .shared
-            .lives(&keys)?
-            .into_iter()
-            .find(|other| *other < session.shared.inbox.instance)
-        {
-            Some(other) => Err(session.shared.name_taken(config, &other)),
-            None => Ok(session),
+        // Two that looked at the same moment did not see each other: look again, and the greater instance leaves. One that was
+        // here before and could not be seen says so itself.
+        let others = session.shared.lives(&keys)?;
+        if let Some(other) = others.iter().find(|other| **other < session.shared.inbox.instance) {
+            return Err(session.shared.name_taken(config, other));
         }
+        for other in &others {
+            session.shared.inbox.on_namesake(other);
+        }
+        Ok(session)
     }
 
     /// This host.
@@ -300,6 +299,13 @@ impl Shared {
             .background()
             .wait()
             .map_err(|source| Error::Declare { key, source })?;
+        let (key, inbox) = (keys.build(&Key::Claim(host.clone())), Arc::clone(&self.inbox));
+        zenoh
+            .declare_subscriber(key.clone())
+            .callback(move |put: Put| inbox.on_claim(&put))
+            .background()
+            .wait()
+            .map_err(|source| Error::Declare { key, source })?;
         let (key, inbox) = (keys.all_alive(), Arc::clone(&self.inbox));
         zenoh
             .liveliness()
@@ -375,7 +381,7 @@ impl Shared {
             .wait()
             .map_err(|source| Error::Declare { key, source })?;
         *self.token.lock() = Some(token);
-        inbox.joined.store(true, Ordering::Release);
+        inbox.joined();
         Ok(())
     }
 
@@ -386,6 +392,15 @@ impl Shared {
         {
             tracing::debug!(host = %self.inbox.host, %error, "the token was not taken back");
         }
+    }
+
+    /// Says this host's claim to its name. False where there is nobody left to say it to.
+    pub(crate) fn say_claim(&self) -> bool {
+        let Some(claim) = self.inbox.claim() else { return false };
+        if let Err(error) = wire::encode(&claim).and_then(|bytes| self.lanes.claim(bytes)) {
+            tracing::debug!(host = %self.inbox.host, %error, "a claim to the name was not sent");
+        }
+        true
     }
 
     pub(crate) fn warm(&self, host: &HostId) {
@@ -427,14 +442,19 @@ async fn waiting<T: Send + 'static>(host: &HostId, call: impl FnOnce() -> T + Se
     receiver.await.map_err(|_| Error::Closed { host: host.clone() })
 }
 
-/// One life: the time, and eight bytes of the random identity that Zenoh drew for the session.
+/// One life: the random identity that Zenoh drew for the session.
 fn instance(zenoh: &zenoh::Session) -> Instance {
-    let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-    let random = zenoh
+    let (low, high) = zenoh
         .zid()
         .to_le_bytes()
-        .iter()
-        .take(8)
-        .fold(0, |sum, &byte| (sum << 8) | u64::from(byte));
-    Instance::new(u64::try_from(since.as_micros()).unwrap_or(u64::MAX), random)
+        .into_iter()
+        .enumerate()
+        .fold((0, 0), |(low, high), (place, byte)| {
+            if place < 8 {
+                (low << 8 | u64::from(byte), high)
+            } else {
+                (low, high << 8 | u64::from(byte))
+            }
+        });
+    Instance::new(high, low)
 }

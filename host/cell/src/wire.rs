@@ -4,7 +4,7 @@
 //! Never: panics on any bytes; knows of Zenoh.
 //!
 //! ```text
-//! byte 0      version, now 1; the message's kind is in its key
+//! byte 0      version, now 3; the message's kind is in its key
 //! byte 1..    postcard (variable-length integers, no field names)
 //! ```
 //!
@@ -25,7 +25,7 @@ use crate::{
 };
 
 /// The version that this host writes and reads.
-pub const VERSION: u8 = 2;
+pub const VERSION: u8 = 3;
 
 /// What can be sent. The bound and the checks of each message stand beside its name.
 pub trait Letter: Serialize + DeserializeOwned {

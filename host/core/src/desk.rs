@@ -195,7 +195,9 @@ impl Desk {
     /// the ownership; what it still waits for goes to the next, at once.
     pub fn set_members(&mut self, now_ns: u64, members: Vec<HostId>) -> Option<Dispatch> {
         self.members = members;
-        self.suspects.retain(|s| s.until_ns > now_ns || s.strikes > 0);
+        // Who was not silent again within the longest time begins anew; so nobody who left for good is remembered for good.
+        self.suspects
+            .retain(|s| now_ns < s.until_ns.saturating_add(SUSPECT_NS_MAX));
         let gone = self.arbiter.owner().is_some_and(|owner| !self.members.contains(owner));
         if !gone {
             return None;

@@ -26,6 +26,7 @@ pub mod wiring;
 
 pub mod alarms;
 pub mod arbiter;
+pub mod chatter;
 pub mod damping;
 pub mod desk;
 pub mod guard;

@@ -137,6 +137,16 @@ pub enum Refusal {
     NoSuchLoop,
 }
 
+/// A change of revision that a replica repeats, so that it can be voted on: the state goes from one component to the other, which
+/// then steps.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Switch {
+    /// Revision whose component made the state.
+    pub from: u64,
+    /// Revision whose component goes on from it.
+    pub to: u64,
+}
+
 /// A step for a replica.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct StepRequest {
@@ -154,6 +164,8 @@ pub struct StepRequest {
     pub frame: Frame,
     /// The state before.
     pub state: Arc<[u8]>,
+    /// In the cycle of a change that is voted on: which; `digest`, `limit_ns` and `frame` are those of the revision that comes in.
+    pub switch: Option<Switch>,
 }
 
 /// A replica's answer.

@@ -150,7 +150,7 @@ pub enum OnBump {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum OnFewer {
-    /// A majority of those that are left decides; the last one alone.
+    /// A majority of those that are left decides; the last one alone, and then nothing stands against an error of it.
     GoOn,
     /// A majority of the number asked for is needed all the same; without it the cycle is a faulty one.
     Fault,
@@ -200,7 +200,8 @@ impl Default for Policy {
             on_bump: OnBump::Refuse,
             probation_cycles: 20,
             probation_deviation_percent: None,
-            on_fewer: OnFewer::GoOn,
+            // Whoever asks for a vote fears a machine that errs; it may be the one that is left.
+            on_fewer: OnFewer::Fault,
         }
     }
 }

@@ -12,11 +12,16 @@ use crate::{room::Room, view::Counters};
 impl Room {
     /// What this host counts.
     pub(crate) fn counters(&self) -> Counters {
-        let now = Instant::now();
+        let (now, hosts) = (Instant::now(), self.session.hosts().len());
         let get = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
         let log = self.cycles.as_ref().map(|cycles| cycles.counts()).unwrap_or_default();
         let mut counters = Counters {
-            hosts_alive: self.roster.all().iter().filter(|(_, seen)| seen.alive(now)).count() as u64,
+            hosts_alive: self
+                .roster
+                .all()
+                .iter()
+                .filter(|(_, seen)| seen.alive(now, hosts))
+                .count() as u64,
             loops_known: self.book.len() as u64,
             loops_held: self.holder.len() as u64,
             loops_owned: u64::from(self.field.owned()),

@@ -554,7 +554,7 @@ impl Room {
         let vitals = seen.vitals.as_ref();
         HostView {
             here: id == self.here,
-            alive: seen.alive(now),
+            alive: seen.alive(now, self.session.hosts().len()),
             io: vitals.is_some_and(|v| v.roles.io),
             control: vitals.is_some_and(|v| v.roles.control),
             draining: vitals.is_some_and(|v| v.draining),

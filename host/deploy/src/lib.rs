@@ -52,6 +52,7 @@ mod roster;
 mod service;
 mod shadows;
 mod sync;
+mod telling;
 mod trials;
 mod uploads;
 mod verdict;

@@ -4,7 +4,7 @@
 //! Never: runs a component; `bench` does.
 //!
 //! ```text
-//! unknown ──upload or copy──► in the library (labels and notes change) ──remove──► removed (remembered by time) ──upload again──► in the library
+//! unknown ──upload or copy──► in the library (labels and notes change) ──remove──► removed (remembered by its upload) ──upload again──► in the library
 //! ```
 
 use std::{collections::BTreeMap, sync::Arc};
@@ -25,13 +25,13 @@ const REMOVED: &str = "components-removed";
 /// Fewest digits of a digest that may stand for it.
 const DIGITS_MIN: usize = 8;
 
-/// A component and when it was removed, in ms of Unix time.
+/// A component that was removed, and when the upload that was taken back came in, in ms of Unix time.
 pub(crate) type Dated = (Digest, u64);
 
 #[derive(Debug, Default)]
 struct Shelves {
     infos: BTreeMap<Digest, Arc<ComponentInfo>>,
-    /// Oldest first, with the time in ms of Unix time.
+    /// In the order in which this host heard of them, each with the upload that was taken back: its time in ms of Unix time.
     removed: Vec<(Digest, u64)>,
 }
 
@@ -262,7 +262,7 @@ impl Library {
         Ok(())
     }
 
-    /// Removes a component as of a time in ms of Unix time. Says whether there was one from before that.
+    /// Takes back the upload of a time in ms of Unix time, and those before it. Says whether there was one.
     pub(crate) async fn remove(&self, digest: Digest, at_ms: u64) -> Result<bool, Error> {
         let removed = {
             let mut shelves = self.shelves.write();
@@ -275,7 +275,6 @@ impl Library {
             }
             shelves.removed.retain(|(d, _)| *d != digest);
             shelves.removed.push((digest, at_ms));
-            shelves.removed.sort_by_key(|(_, at_ms)| *at_ms);
             let extra = shelves.removed.len().saturating_sub(REMOVALS_REMEMBERED_MAX);
             shelves.removed.drain(..extra);
             shelves.removed.clone()

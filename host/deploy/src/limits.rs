@@ -119,11 +119,8 @@ pub const HELD_PER_REPORT: usize = 4_096;
 /// How often what runs is compared with what shall run, without a reason.
 pub const RECONCILE_EVERY: Duration = Duration::from_secs(1);
 
-/// How often a host says how it is.
-pub const VITALS_EVERY: Duration = Duration::from_millis(200);
-
-/// Vitals older than this say nothing about now.
-pub const VITALS_FRESH: Duration = Duration::from_secs(2);
+/// How often a host looks how it is. It says so as often as the size of the cell lets it ([`bumpless_core::chatter`]).
+pub const VITALS_EVERY: Duration = Duration::from_nanos(bumpless_core::chatter::VITALS_NS_MIN);
 
 /// How long a host that is no longer a member keeps its instances: another must be ready first, and a host that was only
 /// cut off for a moment comes back.

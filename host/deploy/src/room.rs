@@ -1,7 +1,7 @@
 //! What the parts of deployment share on one host, and the tasks that keep it going.
 //!
 //! ```text
-//! start ──► running: vitals every 200 ms, reconcile every second or when poked, notices as they come
+//! start ──► running: vitals five times a second or less, reconcile every second or when poked, notices as they come
 //!              │ shutdown: draining, others take over
 //!              ▼
 //!           stopped: tasks end, requests are refused
@@ -43,12 +43,11 @@ use crate::{
     holder::Holder,
     home::Homes,
     library::Library,
-    limits::{
-        CHANGES_MAX, NOTICES_WAITING_MAX, RECONCILE_EVERY, REHEARSALS_MAX, SENDING_MAX, UPLOADS_MAX, VITALS_EVERY,
-    },
+    limits::{CHANGES_MAX, NOTICES_WAITING_MAX, RECONCILE_EVERY, REHEARSALS_MAX, SENDING_MAX, UPLOADS_MAX},
     rollout::ledger::Ledger,
     roster::Roster,
     shadows::Shadows,
+    telling::LastTold,
     wire::{self, Ask, Notice, Told},
 };
 
@@ -168,7 +167,8 @@ pub(crate) struct Room {
     /// Held while an upload is let in, so that two of one name do not pass at once.
     pub(crate) admission: tokio::sync::Mutex<()>,
     pub(crate) comparing: Mutex<Comparing>,
-    own: Mutex<Vitals>,
+    pub(crate) own: Mutex<Vitals>,
+    pub(crate) told: Mutex<LastTold>,
     draining: AtomicBool,
     /// The drain holds over a restart.
     pub(crate) drain_kept: AtomicBool,
@@ -247,6 +247,7 @@ impl Room {
             sending: Semaphore::new(SENDING_MAX),
             admission: tokio::sync::Mutex::default(),
             comparing: Mutex::default(),
+            told: Mutex::default(),
             own: Mutex::new(own),
             draining: AtomicBool::new(drain_kept),
             drain_kept: AtomicBool::new(drain_kept),
@@ -354,22 +355,6 @@ impl Room {
         wire::decode_reply(reply)
     }
 
-    /// Tells all hosts. What is lost is found by the next comparison.
-    pub(crate) fn announce(&self, notice: &Notice) {
-        match wire::encode(notice) {
-            Ok(bytes) => self.session.publish_notice(&bytes),
-            Err(error) => tracing::warn!(%error, "a notice was not sent"),
-        }
-    }
-
-    /// Tells all hosts how far this one is, so that they compare.
-    pub(crate) fn announce_standing(&self) {
-        self.announce(&Notice::Standing {
-            library: self.library.mark(),
-            intents: self.book.mark(),
-        });
-    }
-
     /// Takes what arrives. Never blocks.
     pub(crate) fn arrive(self: &Arc<Self>, arrival: DeployArrival) {
         match arrival {
@@ -464,39 +449,6 @@ impl Room {
         self.poke();
     }
 
-    async fn tell_vitals(room: Arc<Self>, mut probe: Probe) {
-        let mut tick = every(VITALS_EVERY);
-        loop {
-            tick.tick().await;
-            let measured = probe.sample();
-            {
-                let mut own = room.own.lock();
-                own.cpu = measured.cpu;
-                own.cpu_process = measured.cpu_process;
-                own.memory_bytes = measured.memory_bytes;
-            }
-            room.tell_vitals_now();
-        }
-    }
-
-    pub(crate) fn tell_vitals_now(&self) {
-        let vitals = {
-            let mut own = self.own.lock();
-            own.seq += 1;
-            own.ready = self.bench.ready();
-            own.loops_owned = self.field.owned();
-            own.loops_held = u32::try_from(self.holder.len()).unwrap_or(u32::MAX);
-            own.draining = self.draining.load(Ordering::Acquire);
-            own.drain_kept = self.drain_kept.load(Ordering::Acquire);
-            own.clone()
-        };
-        self.field.set_host(&vitals);
-        self.session.publish_vitals(&vitals);
-        if self.roster.vitals(vitals) {
-            self.poke();
-        }
-    }
-
     /// Is this host being emptied?
     pub(crate) fn is_draining(&self) -> bool {
         self.draining.load(Ordering::Acquire)
@@ -522,7 +474,7 @@ impl Room {
                             room.poke();
                         }
                     }
-                    room.announce_standing();
+                    room.announce_standing_when_due();
                     room.feed.prune(|id| room.book.get(id).is_some());
                 }
                 () = room.poke_homes.notified() => {}

@@ -15,12 +15,16 @@ use std::{
 };
 
 use bumpless_cell::Vitals;
-use bumpless_core::{HostId, place::Candidate};
+use bumpless_core::{
+    HostId,
+    chatter::{VITALS_MISSED_MAX, VITALS_NS_MIN, pause_ns},
+    place::Candidate,
+};
 use parking_lot::Mutex;
 
 use crate::{
     error::Error,
-    limits::{GONE_SHOWN, HOSTS_MAX, VITALS_FRESH},
+    limits::{GONE_SHOWN, HOSTS_MAX},
 };
 
 /// One host.
@@ -34,9 +38,10 @@ pub(crate) struct Seen {
 }
 
 impl Seen {
-    /// There, and heard of lately.
-    pub(crate) fn alive(&self, now: Instant) -> bool {
-        self.there && self.vitals.is_some() && now.saturating_duration_since(self.changed) < VITALS_FRESH
+    /// There, and heard of lately, for a cell of so many hosts.
+    pub(crate) fn alive(&self, now: Instant, hosts: usize) -> bool {
+        let missed = Duration::from_nanos(pause_ns(VITALS_NS_MIN, hosts).saturating_mul(VITALS_MISSED_MAX));
+        self.there && self.vitals.is_some() && now.saturating_duration_since(self.changed) < missed
     }
 }
 
@@ -195,6 +200,28 @@ pub(crate) fn back_off(tries: u32) -> Duration {
     least.saturating_mul(1 << tries.saturating_sub(1).min(16)).min(most)
 }
 
+/// Vitals of a host of which nothing is known.
+#[cfg(test)]
+pub(crate) fn test_vitals(host: &HostId) -> Vitals {
+    Vitals {
+        host: host.clone(),
+        seq: 0,
+        started_at_ms: 1,
+        roles: bumpless_cell::Roles::default(),
+        api: None,
+        cpu: 0.0,
+        cpu_process: 0.0,
+        memory_bytes: 0,
+        ready: Vec::new(),
+        loops_owned: 0,
+        loops_held: 0,
+        draining: false,
+        drain_kept: false,
+        labels: Vec::new(),
+        version: String::new(),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used, reason = "tests")]
@@ -205,24 +232,13 @@ mod tests {
 
     fn vitals(host: &str, seq: u64, draining: bool) -> Vitals {
         Vitals {
-            host: HostId::new(host).unwrap(),
             seq,
-            started_at_ms: 1,
             roles: Roles {
                 io: host == "io",
                 control: host != "io",
             },
-            api: None,
-            cpu: 0.0,
-            cpu_process: 0.0,
-            memory_bytes: 0,
-            ready: vec![],
-            loops_owned: 0,
-            loops_held: 0,
             draining,
-            drain_kept: false,
-            labels: vec![],
-            version: String::new(),
+            ..test_vitals(&HostId::new(host).unwrap())
         }
     }
 

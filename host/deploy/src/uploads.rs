@@ -246,7 +246,9 @@ impl Room {
                  that each can be gone back to",
             ));
         }
-        let at_ms = self.clock.unix_ms().max(info.uploaded_at_unix_ms);
+        // Dated by the upload that it takes back, and not by a clock: whatever this host's date is, it takes back that one and none
+        // that comes after it.
+        let at_ms = info.uploaded_at_unix_ms;
         self.component_gone(info.digest, at_ms).await?;
         self.announce(&Notice::ComponentGone(info.digest, at_ms));
         Ok(())

@@ -110,6 +110,7 @@ impl Worker {
                         limit_ns: pending.request.limit_ns,
                         frame: pending.request.frame.clone(),
                         state: Arc::clone(&pending.request.state),
+                        switch: None,
                     };
                     self.shared.wire.send_step(&host, &request);
                     pending.asked = host;

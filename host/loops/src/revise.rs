@@ -1,13 +1,23 @@
 //! Going on with another revision inside a cycle: forwards when a command asks for it, backwards when probation fails.
 //!
-//! Both components step on the same frame here, on the owner, so the bump is measured and not guessed.
-//! Never: asks a replica; a switch is one host's work within one cycle.
+//! Both components step on the same frame here, on the owner, so the bump is measured and not guessed. Where the loop votes, the
+//! replicas repeat the change, and the majority's first step is the one that counts:
+//!
+//! ```text
+//! old step, state handed over, new step, bump: here ─► no vote ─────────────────────────────────────► taken, or refused
+//!                                                  └─► ballot: replicas hand over and step ─► majority ─► taken, its bump measured
+//!                                                                                        └─► none ─► refused, the cycle holds
+//! ```
+//! Never: goes on from a state that one machine alone has made, where the loop votes; but for the way back in probation.
 
 use std::sync::Arc;
 
 use bumpless_core::{
     CommandId, Effects, Event as CycleEvent, Fault, Frame, LoopId, Mode, OnBump, Outcome, OutputLimit, Reading, guard,
-    seat::Stepped, swap,
+    protocol::Switch,
+    seat::Stepped,
+    swap,
+    vote::{Ballot, Cast},
 };
 use bumpless_engine::Origin;
 
@@ -71,11 +81,14 @@ pub(crate) fn missing_input(held: &HeldRevision, port: u8) -> Fault {
 impl Worker {
     /// No good step. In probation, the old component gets this very cycle; else the loop's policy decides.
     pub(crate) fn without_a_step(&mut self, id: &LoopId, mut running: Running, fault: Fault) {
+        // Too few replicas say nothing about the component, and the way back is one machine's work.
+        let too_few = running.redundancy.vote.is_some() && matches!(fault, Fault::NotReady { .. });
         let back = running
             .base
             .as_ref()
             .and_then(|r| r.probation)
-            .map(|(revision, _)| revision);
+            .map(|(revision, _)| revision)
+            .filter(|_| !too_few);
         let Some(seat) = self.seats.get_mut(id) else { return };
         let places = back.and_then(|back| {
             let new = seat
@@ -190,22 +203,18 @@ impl Worker {
         None
     }
 
-    /// A change of revision: both components step on the same frame here, and the bump decides. `fault` is the old one's,
-    /// where it need not be tried.
+    /// A change of revision: both components step on the same frame here, and the bump decides; then the replicas, where there is a
+    /// ballot. `fault` is the old one's, where it need not be tried.
     pub(crate) fn revise(
         &mut self,
         id: &LoopId,
         mut running: Running,
-        command: CommandId,
-        revision: u64,
+        (command, revision): (CommandId, u64),
         fault: Option<Fault>,
+        ballot: Option<Ballot>,
     ) {
         let Some(seat) = self.seats.get_mut(id) else { return };
-        let Some(old_index) = seat
-            .held
-            .iter()
-            .position(|h| h.spec.revision == running.sample.revision)
-        else {
+        let Some(old_index) = place(seat, running.sample.revision) else {
             return;
         };
         let began_ns = self.shared.now_ns();
@@ -219,7 +228,7 @@ impl Worker {
         if let Err(fault) = &old_step {
             seat.remember_overrun(&running, fault);
         }
-        let attempt = match seat.held.iter().position(|h| h.spec.revision == revision) {
+        let mut attempt = match place(seat, revision) {
             Some(new_index) if new_index != old_index => {
                 try_revision(seat, old_index, new_index, &running, old_step.as_ref().ok())
             }
@@ -230,48 +239,116 @@ impl Worker {
             )),
         };
         let step_ns = self.shared.now_ns() - began_ns;
-        let by = self.shared.here.clone();
-        match attempt {
-            Ok(tried) => {
-                running.events.push(CycleEvent::Revised {
-                    from: running.sample.revision,
-                    from_digest: seat.held[old_index].spec.digest,
-                    by: tried.by.to_owned(),
-                    bump_percent: tried.bump_percent,
-                });
-                if let Some(limit_percent) = tried.over_percent {
-                    running.events.push(CycleEvent::OverBump {
-                        bump_percent: tried.bump_percent,
-                        limit_percent,
-                    });
-                }
-                running.standing.remember(command, Outcome::Done);
-                let spec = &seat.held[tried.index].spec;
-                let probation = (spec.policy.probation_cycles > 0 && tried.by != "same")
-                    .then_some((running.sample.revision, spec.policy.probation_cycles));
-                running.standing.manual = tried.manual;
-                running.state = tried.state;
-                let step = Ok(Stepped {
-                    effects: tried.effects,
-                    by,
-                    step_ns,
-                });
-                self.conclude_with(id, running, step, tried.index, tried.readings, probation);
+        if let Ok(tried) = &mut attempt {
+            let mut own = Ok(std::mem::take(&mut tried.effects));
+            self.shared.disturb(&mut own);
+            tried.effects = own.unwrap_or_default();
+        }
+        match (attempt, ballot) {
+            (Ok(tried), Some(ballot)) => {
+                let own = Ok(tried.effects.clone());
+                running.switch = Some(Box::new(Switching {
+                    command,
+                    tried,
+                    old_effects: old_step.ok(),
+                }));
+                self.open_ballot_with(id, running, ballot, own);
             }
-            Err(reason) => {
+            (Ok(tried), None) => self.take_revision(id, running, command, tried, step_ns),
+            (Err(reason), ballot) => {
                 running.standing.remember(command, Outcome::Refused(reason));
-                match old_step {
-                    Ok(effects) => self.conclude(id, running, Ok(Stepped { effects, by, step_ns })),
-                    Err(fault) => self.without_a_step(id, running, fault),
+                let by = self.shared.here.clone();
+                match (old_step, ballot) {
+                    (Ok(_), Some(ballot)) => self.open_ballot(id, running, ballot),
+                    (Ok(effects), None) => self.conclude(id, running, Ok(Stepped { effects, by, step_ns })),
+                    (Err(fault), _) => self.without_a_step(id, running, fault),
                 }
+            }
+        }
+    }
+
+    /// Ends the cycle under the new revision.
+    fn take_revision(&mut self, id: &LoopId, mut running: Running, command: CommandId, tried: Tried, step_ns: u64) {
+        let Some(seat) = self.seats.get_mut(id) else { return };
+        let Some((old_index, index)) = place(seat, running.sample.revision).zip(place(seat, tried.revision)) else {
+            return;
+        };
+        running.events.push(CycleEvent::Revised {
+            from: running.sample.revision,
+            from_digest: seat.held[old_index].spec.digest,
+            by: tried.by.to_owned(),
+            bump_percent: tried.bump_percent,
+        });
+        if let Some(limit_percent) = tried.over_percent {
+            running.events.push(CycleEvent::OverBump {
+                bump_percent: tried.bump_percent,
+                limit_percent,
+            });
+        }
+        running.standing.remember(command, Outcome::Done);
+        let spec = &seat.held[index].spec;
+        let probation = (spec.policy.probation_cycles > 0 && tried.by != "same")
+            .then_some((running.sample.revision, spec.policy.probation_cycles));
+        running.standing.manual = tried.manual;
+        running.state = tried.state;
+        let step = Ok(Stepped {
+            effects: tried.effects,
+            by: self.shared.here.clone(),
+            step_ns,
+        });
+        self.conclude_with(id, running, step, index, tried.readings, probation);
+    }
+
+    /// The replicas have voted on a change: what a majority made of it, or why there is none.
+    pub(crate) fn switched(
+        &mut self,
+        id: &LoopId,
+        mut running: Running,
+        decided: Result<Effects, String>,
+        step_ns: u64,
+    ) {
+        let Some(switching) = running.switch.take() else { return };
+        let Switching {
+            command,
+            mut tried,
+            old_effects,
+        } = *switching;
+        let Some(seat) = self.seats.get_mut(id) else { return };
+        let taken = decided.and_then(|effects| {
+            if !Cast::Effects(effects.clone()).same(&Cast::Effects(tried.effects.clone())) {
+                // This host was outvoted, so what it measured was not what will be sent.
+                tried.effects = effects;
+                let places = place(seat, running.sample.revision).zip(place(seat, tried.revision));
+                let (old, new) = places.ok_or_else(|| format!("revision {} was released meanwhile", tried.revision))?;
+                tried.bump_percent = bump_percent(
+                    seat,
+                    (old, new),
+                    &running,
+                    &tried.readings,
+                    old_effects.as_ref(),
+                    &tried.effects,
+                );
+                tried.over_percent = over_percent(&seat.held[new], tried.bump_percent)?;
+            }
+            Ok(tried)
+        });
+        match taken {
+            Ok(tried) => self.take_revision(id, running, command, tried, step_ns),
+            Err(reason) => {
+                running.standing.remember(command, Outcome::Refused(reason.clone()));
+                let fault = Fault::NotReady {
+                    host: "a majority".to_owned(),
+                    reason,
+                };
+                self.without_a_step(id, running, fault);
             }
         }
     }
 }
 
 /// A new revision that may take over.
-struct Tried {
-    index: usize,
+pub(crate) struct Tried {
+    revision: u64,
     readings: Vec<Reading>,
     /// The operator's outputs, in its order.
     manual: Vec<f64>,
@@ -283,20 +360,89 @@ struct Tried {
     over_percent: Option<f64>,
 }
 
-/// Hands the state over, steps the new component on the same frame and measures the bump. Says in words why not.
-fn try_revision(
+/// A change that waits for the votes of other hosts.
+pub(crate) struct Switching {
+    command: CommandId,
+    tried: Tried,
+    /// What the old component would have sent; none where it failed.
+    old_effects: Option<Effects>,
+}
+
+impl Switching {
+    /// The revision that comes in.
+    pub(crate) const fn to(&self) -> u64 {
+        self.tried.revision
+    }
+
+    /// One reading per port of its component.
+    pub(crate) fn readings(&self) -> &[Reading] {
+        &self.tried.readings
+    }
+}
+
+fn place(seat: &Seat, revision: u64) -> Option<usize> {
+    seat.held.iter().position(|h| h.spec.revision == revision)
+}
+
+/// The new component's first step, from the state of the old one.
+struct Entered {
+    state: Arc<[u8]>,
+    by: &'static str,
+    effects: Effects,
+}
+
+/// Hands the state over and steps the new component. An error says what failed, and how.
+fn enter(
     seat: &mut Seat,
-    old_index: usize,
-    new_index: usize,
-    running: &Running,
-    old_effects: Option<&Effects>,
-) -> Result<Tried, String> {
-    let old = &seat.held[old_index];
-    let readings = match &running.sample.next_readings {
-        Some((revision, readings)) if *revision == seat.held[new_index].spec.revision => readings.clone(),
-        _ => old.wiring.remap(&running.frame.readings, &seat.held[new_index].wiring),
+    (old, new): (usize, usize),
+    frame: &Frame,
+    state: &Arc<[u8]>,
+) -> Result<Entered, (&'static str, Fault)> {
+    let (from, hand_over) = (
+        origin(&seat.held[old]),
+        swap::hand_over(&seat.held[old].spec, &seat.held[new].spec),
+    );
+    let new = &mut seat.held[new];
+    let limit_ns = new.spec.step_limit_ns();
+    let actuators = track(new, &frame.readings);
+    let (state, by): (Arc<[u8]>, _) = match hand_over {
+        swap::HandOver::Same => (Arc::clone(state), "same"),
+        other => take_over(new, carried(other, &from, state), &actuators, limit_ns)
+            .map(|(state, by)| (Arc::from(state), by))
+            .map_err(|fault| ("no state could be made for the new component", fault))?,
     };
-    let (from, hand_over) = (origin(old), swap::hand_over(&old.spec, &seat.held[new_index].spec));
+    let effects = new
+        .instance
+        .step(frame, &state, limit_ns)
+        .map_err(|fault| ("its first step failed", fault))?;
+    Ok(Entered { state, by, effects })
+}
+
+/// A change that another host votes on, repeated here. None where one of the two revisions is not held.
+pub(crate) fn repeat(
+    seat: &mut Seat,
+    switch: Switch,
+    frame: &Frame,
+    state: &Arc<[u8]>,
+) -> Option<Result<Effects, Fault>> {
+    let (old, new) = place(seat, switch.from).zip(place(seat, switch.to))?;
+    if frame.readings.len() != seat.held[new].wiring.points.len() {
+        return None;
+    }
+    let entered = enter(seat, (old, new), frame, state);
+    Some(entered.map(|entered| entered.effects).map_err(|(_, fault)| fault))
+}
+
+/// By how much the outputs of the new component differ from what the old one would have sent, in % of their spans.
+fn bump_percent(
+    seat: &Seat,
+    (old, new): (usize, usize),
+    running: &Running,
+    readings: &[Reading],
+    old_effects: Option<&Effects>,
+    new_effects: &Effects,
+) -> f64 {
+    let (old, new) = (&seat.held[old], &seat.held[new]);
     let dt_ns = running.frame.cycle.dt_ns;
     let mode = running.standing.mode;
     let actuators_old = track(old, &running.frame.readings);
@@ -309,6 +455,44 @@ fn try_revision(
             guard::guard(mode, &wanted, manual, &actuators_old, &old.wiring.limits, dt_ns).outputs
         },
     );
+    let actuators = track(new, readings);
+    let wanted = new.wiring.wanted(&new_effects.writes, &actuators);
+    let manual = new
+        .wiring
+        .outputs_from(&running.standing.manual, &old.wiring, &actuators);
+    let new_outputs = guard::guard(mode, &wanted, &manual, &actuators, &new.wiring.limits, dt_ns).outputs;
+    swap::bump_between((&old.wiring, &old_outputs), (&new.wiring, &new_outputs), &actuators)
+}
+
+/// The loop's limit, where a bump is beyond it and the policy lets it pass; in words where it does not.
+fn over_percent(new: &HeldRevision, bump_percent: f64) -> Result<Option<f64>, String> {
+    let limit = new.spec.policy.bump_limit_percent;
+    let over = (bump_percent > limit).then_some(limit);
+    if over.is_some() && new.spec.policy.on_bump == OnBump::Refuse {
+        return Err(format!(
+            "the output would step by {bump_percent:.3} % of its span beyond what the old controller does; \
+             the loop allows {limit} % (policy.bump_limit_percent)"
+        ));
+    }
+    Ok(over)
+}
+
+/// Hands the state over, steps the new component on the same frame and measures the bump. Says in words why not.
+fn try_revision(
+    seat: &mut Seat,
+    old_index: usize,
+    new_index: usize,
+    running: &Running,
+    old_effects: Option<&Effects>,
+) -> Result<Tried, String> {
+    let revision = seat.held[new_index].spec.revision;
+    let readings = match &running.sample.next_readings {
+        Some((of, readings)) if *of == revision => readings.clone(),
+        _ => {
+            let old = &seat.held[old_index];
+            old.wiring.remap(&running.frame.readings, &seat.held[new_index].wiring)
+        }
+    };
     let new = &mut seat.held[new_index];
     if readings.len() != new.wiring.points.len() {
         return Err("the sample's readings do not fit the new component's ports".to_owned());
@@ -316,39 +500,21 @@ fn try_revision(
     if let Some(port) = new.wiring.bad_input(&readings) {
         return Err(missing_input(new, port).to_string());
     }
-    let limit_ns = new.spec.step_limit_ns();
-    let actuators = track(new, &readings);
-    let (state, by): (Arc<[u8]>, _) = match hand_over {
-        swap::HandOver::Same => (Arc::clone(&running.state), "same"),
-        other => take_over(new, carried(other, &from, &running.state), &actuators, limit_ns)
-            .map(|(state, by)| (Arc::from(state), by))
-            .map_err(|fault| format!("no state could be made for the new component: {fault}"))?,
-    };
     let frame = Frame {
         readings: readings.clone(),
         ..running.frame.clone()
     };
-    let effects = new
-        .instance
-        .step(&frame, &state, limit_ns)
-        .map_err(|fault| format!("its first step failed: {fault}"))?;
-    let wanted = new.wiring.wanted(&effects.writes, &actuators);
+    let places = (old_index, new_index);
+    let Entered { state, by, effects } =
+        enter(seat, places, &frame, &running.state).map_err(|(what, fault)| format!("{what}: {fault}"))?;
+    let bump_percent = bump_percent(seat, places, running, &readings, old_effects, &effects);
     let (old, new) = (&seat.held[old_index], &seat.held[new_index]);
+    let over_percent = over_percent(new, bump_percent)?;
     let manual = new
         .wiring
-        .outputs_from(&running.standing.manual, &old.wiring, &actuators);
-    let new_outputs = guard::guard(mode, &wanted, &manual, &actuators, &new.wiring.limits, dt_ns).outputs;
-    let bump_percent = swap::bump_between((&old.wiring, &old_outputs), (&new.wiring, &new_outputs), &actuators);
-    let limit = new.spec.policy.bump_limit_percent;
-    let over_percent = (bump_percent > limit).then_some(limit);
-    if over_percent.is_some() && new.spec.policy.on_bump == OnBump::Refuse {
-        return Err(format!(
-            "the output would step by {bump_percent:.3} % of its span beyond what the old controller does; \
-             the loop allows {limit} % (policy.bump_limit_percent)"
-        ));
-    }
+        .outputs_from(&running.standing.manual, &old.wiring, &track(new, &readings));
     Ok(Tried {
-        index: new_index,
+        revision,
         readings,
         manual,
         state,

@@ -4,7 +4,7 @@
 //! sample ─► base? ─ no ─► NeedRecord
 //!            │ yes
 //!            ▼
-//!          settle ─► [revise: old and new component on the same frame, here] ─► conclude ─► commit
+//!          settle ─► [revise: old and new component on the same frame, here; a vote on it] ─► conclude ─► commit
 //!            │ no change
 //!            ▼
 //!          attempts: replica ─ answer ─► conclude ─► commit
@@ -18,7 +18,7 @@ use std::{collections::VecDeque, sync::Arc};
 
 use crate::{
     event::HeldRevision,
-    revise::{missing_input, take_over, track},
+    revise::{Switching, missing_input, take_over, track},
     vote::{Late, redundancy},
     worker::{Timer, Worker},
 };
@@ -56,6 +56,8 @@ pub(crate) struct Running {
     pub(crate) attempts: Attempts,
     /// Instead of the attempts, where the strategy is a vote.
     pub(crate) ballot: Option<Ballot>,
+    /// The change of revision that the ballot is about, where it is about one.
+    pub(crate) switch: Option<Box<Switching>>,
     pub(crate) redundancy: Redundancy,
     pub(crate) hedge_ns: u64,
     pub(crate) asked: Vec<Asked>,
@@ -316,6 +318,7 @@ impl Worker {
         let running = Running {
             attempts: Attempts::new(order, here, hedge_ns, here_at_ns),
             ballot: None,
+            switch: None,
             redundancy,
             hedge_ns,
             state: state.unwrap_or_else(|_| Arc::from([])),
@@ -333,7 +336,7 @@ impl Worker {
         match (running.standing.revise, fault) {
             // Another component would not see any better.
             (_, Some(fault)) if bad_input.is_some() => self.conclude(&id, running, Err(fault)),
-            (Some((command, revision)), fault) => self.revise(&id, running, command, revision, fault),
+            (Some((command, revision)), fault) => self.revise(&id, running, (command, revision), fault, ballot),
             (None, Some(fault)) => self.without_a_step(&id, running, fault),
             (None, None) => match ballot {
                 Some(ballot) => self.open_ballot(&id, running, ballot),

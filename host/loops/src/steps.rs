@@ -5,11 +5,12 @@
 use std::sync::Arc;
 
 use bumpless_core::{
-    Effects, Fault, HostId, LoopId,
-    protocol::{StepAnswer, StepRequest},
+    Effects, Fault, Frame, HostId, LoopId,
+    protocol::{StepAnswer, StepRequest, Switch},
 };
 
 use crate::{
+    revise::repeat,
     seat::{Asked, Running},
     worker::Worker,
 };
@@ -18,15 +19,26 @@ impl Worker {
     /// The request for a step of the cycle; [`Worker::ask`] numbers it. None where the revision is not held (any more).
     pub(crate) fn request(&self, id: &LoopId, running: &Running) -> Option<StepRequest> {
         let seat = self.seats.get(id)?;
-        let held = seat.held.iter().find(|h| h.spec.revision == running.sample.revision)?;
+        let in_force = running.sample.revision;
+        let (revision, readings) = match &running.switch {
+            Some(switching) => (switching.to(), switching.readings()),
+            None => (in_force, running.frame.readings.as_slice()),
+        };
+        let held = seat.held.iter().find(|h| h.spec.revision == revision)?;
+        let (from, to) = (in_force, revision);
         Some(StepRequest {
             from: self.shared.here.clone(),
             correlation: 0,
             loop_id: id.clone(),
             digest: held.spec.digest,
             limit_ns: held.spec.step_limit_ns(),
-            frame: running.frame.clone(),
+            frame: Frame {
+                cycle: running.frame.cycle,
+                readings: readings.to_vec(),
+                messages: running.frame.messages.clone(),
+            },
             state: Arc::clone(&running.state),
+            switch: running.switch.as_ref().map(|_| Switch { from, to }),
         })
     }
 
@@ -62,6 +74,7 @@ impl Worker {
             limit_ns,
             frame,
             state,
+            switch,
         } = request;
         let began_ns = self.shared.now_ns();
         let here = self.shared.here.clone();
@@ -69,12 +82,17 @@ impl Worker {
             host: here.to_string(),
             reason: reason.to_owned(),
         };
-        let held = self
-            .seats
-            .get_mut(&loop_id)
-            .and_then(|s| s.held.iter_mut().find(|h| h.spec.digest == digest));
-        let mut result = match held {
-            Some(held) => held.instance.step(&frame, &state, limit_ns),
+        let seat = self.seats.get_mut(&loop_id);
+        let step = match (seat, switch) {
+            (Some(seat), Some(switch)) => repeat(seat, switch, &frame, &state),
+            (Some(seat), None) => {
+                let held = seat.held.iter_mut().find(|h| h.spec.digest == digest);
+                held.map(|held| held.instance.step(&frame, &state, limit_ns))
+            }
+            (None, _) => None,
+        };
+        let mut result = match step {
+            Some(result) => result,
             None if crate::calls::is_call(&loop_id) => self.step_for_call(&digest, &frame, &state, limit_ns),
             None => Err(not_ready("the loop is not held here")),
         };

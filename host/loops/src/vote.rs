@@ -7,6 +7,7 @@
 //!                             a majority ─► conclude                  │
 //!                             none possible, or time is up ───────────┴─► the loop's policy
 //! ```
+//! In the cycle of a change the ballot is about the new component's first step, state handed over and all (`revise`).
 //! A dissenter is never waited for: what comes after the decision is judged then, and counts in the next cycle.
 //! Never: asks twice, or waits longer than a cycle without a vote would.
 
@@ -86,11 +87,35 @@ impl Seat {
 
 impl Worker {
     /// Asks everyone who votes or steps along, steps here, and looks how it stands.
-    pub(crate) fn open_ballot(&mut self, id: &LoopId, mut running: Running, ballot: Ballot) {
-        let now_ns = self.shared.now_ns();
-        let Some(mut request) = self.request(id, &running) else {
+    pub(crate) fn open_ballot(&mut self, id: &LoopId, running: Running, ballot: Ballot) {
+        let Some(running) = self.ask_voters(id, running, ballot) else {
             return;
         };
+        let Some((step, _)) = self.step_here(id, &running) else {
+            return;
+        };
+        if let (Err(fault), Some(seat)) = (&step, self.seats.get_mut(id)) {
+            seat.remember_overrun(&running, fault);
+        }
+        self.voted_here(id, running, step);
+    }
+
+    /// The same where this host has stepped already.
+    pub(crate) fn open_ballot_with(
+        &mut self,
+        id: &LoopId,
+        running: Running,
+        ballot: Ballot,
+        step: Result<bumpless_core::Effects, Fault>,
+    ) {
+        if let Some(running) = self.ask_voters(id, running, ballot) {
+            self.voted_here(id, running, step);
+        }
+    }
+
+    fn ask_voters(&mut self, id: &LoopId, mut running: Running, ballot: Ballot) -> Option<Running> {
+        let now_ns = self.shared.now_ns();
+        let mut request = self.request(id, &running)?;
         let here = self.shared.here.clone();
         let others: Vec<HostId> = ballot.asked().filter(|h| **h != here).cloned().collect();
         for host in others {
@@ -98,13 +123,11 @@ impl Worker {
         }
         running.next_at_ns = now_ns + running.hedge_ns;
         running.ballot = Some(ballot);
-        let Some((step, _)) = self.step_here(id, &running) else {
-            return;
-        };
-        if let (Err(fault), Some(seat)) = (&step, self.seats.get_mut(id)) {
-            seat.remember_overrun(&running, fault);
-        }
-        let until_ns = running.next_at_ns;
+        Some(running)
+    }
+
+    fn voted_here(&mut self, id: &LoopId, running: Running, step: Result<bumpless_core::Effects, Fault>) {
+        let (here, until_ns) = (self.shared.here.clone(), running.next_at_ns);
         self.at(until_ns, crate::worker::Timer::Seat(id.clone()));
         self.voted(id, running, &here, step);
     }
@@ -202,6 +225,10 @@ impl Worker {
         });
         let step_ns = self.shared.now_ns().saturating_sub(running.started_ns);
         match closed.decided {
+            Cast::Effects(effects) if running.switch.is_some() => self.switched(id, running, Ok(effects), step_ns),
+            Cast::Fault(fault) if running.switch.is_some() => {
+                self.switched(id, running, Err(format!("its first step failed: {fault}")), step_ns);
+            }
             Cast::Effects(effects) => {
                 let by = self.shared.here.clone();
                 self.conclude(id, running, Ok(Stepped { effects, by, step_ns }));
@@ -213,12 +240,17 @@ impl Worker {
                     agreed: closed.agreed,
                     needed: closed.needed,
                 });
+                let reason = format!(
+                    "{} of {} answers agree, {} are needed",
+                    closed.agreed, closed.answers, closed.needed
+                );
+                if running.switch.is_some() {
+                    let words = format!("replicas did not agree on its first step: {reason}");
+                    return self.switched(id, running, Err(words), step_ns);
+                }
                 let fault = Fault::NotReady {
                     host: "a majority".to_owned(),
-                    reason: format!(
-                        "{} of {} answers agree, {} are needed",
-                        closed.agreed, closed.answers, closed.needed
-                    ),
+                    reason,
                 };
                 self.without_a_step(id, running, fault);
             }

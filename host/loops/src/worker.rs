@@ -12,6 +12,7 @@ use std::{
 
 use bumpless_core::{
     LoopId,
+    chatter::PROBE_NS,
     protocol::{Sample, StepRequest},
 };
 
@@ -28,8 +29,6 @@ use crate::{
 const NAP_NS_MAX: u64 = 1_000_000_000;
 /// Events handled before timers are looked at again.
 const EVENTS_BEFORE_TIMERS_MAX: usize = 64;
-/// Time between probes, in ns.
-const PROBE_NS: u64 = 100_000_000;
 
 /// What a time in the heap is about. A time that was replaced by a later one is passed over when it comes.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]

@@ -5,12 +5,13 @@
 //!
 //! ```text
 //!   offer ──► waiting (newest per loop) ──every 100 ms──► store, in memory ──every 1 s and at close──► disk
-//!                ▲                             │
+//!                ▲                             │                 └──────where somebody waits: at once─────┘
 //!                └──────the write failed───────┘   (unless a newer one waits already)
 //! ```
+//! What is only in the store's memory is gone with the process.
 //!
-//! Where somebody waits for a record to be on the disk ([`RecordWriter::keep`]), whoever was named with
-//! [`RecordWriter::tell_on_disk`] hears of it after the sync, at once where it is asked for.
+//! Where somebody waits for a record to be on the disk ([`RecordWriter::keep`]), the next write goes to the disk, and whoever was
+//! named with [`RecordWriter::tell_on_disk`] hears of it; where it is asked for, that write is made at once.
 //!
 //! A full map (more loops than a host can run) refuses new loops and counts them; a loop that is in it is always taken.
 
@@ -32,7 +33,8 @@ use crate::{error::Error, store::Store};
 /// How often waiting records go to the store.
 const FLUSH_EVERY: Duration = Duration::from_millis(100);
 
-/// How often the store goes to the disk: what a power cut may cost.
+/// How often the store goes to the disk where nobody waits for it: what the end of the process, or a power cut, may cost of what
+/// nobody was told of.
 const SYNC_EVERY: Duration = Duration::from_secs(1);
 
 /// How often a failing disk is logged.
@@ -171,8 +173,8 @@ impl RecordWriter {
         drop(self.shared.on_disk.set(on_disk));
     }
 
-    /// As [`RecordWriter::offer`], and tells when this record, or a later one of its loop, is on the disk: after the next sync,
-    /// which is made at once where `soon` is set. A record that is refused is never told of.
+    /// As [`RecordWriter::offer`], and tells when this record, or a later one of its loop, is on the disk: after the next write,
+    /// within 100 ms and the time of a sync; at once where `soon` is set. A record that is refused is never told of.
     pub fn keep(&self, record: Arc<Record>, soon: bool) {
         let asked = (record.loop_id.clone(), record.position());
         if !self.take_in(record) {
@@ -283,6 +285,13 @@ impl Drop for RecordWriter {
     }
 }
 
+/// Must this write reach the disk? An outcome that somebody may be told of does not wait for the second that others wait: a member's
+/// memory may be all that has it besides, and is gone where every host is killed at once. At ten syncs a second however
+/// many commands there are.
+fn is_sync_due(since_last: Duration, somebody_waits: bool) -> bool {
+    somebody_waits || since_last >= SYNC_EVERY
+}
+
 /// The thread's side.
 struct Worker {
     store: Store,
@@ -300,7 +309,7 @@ impl Worker {
         loop {
             match inbox.recv_timeout(FLUSH_EVERY) {
                 Err(RecvTimeoutError::Timeout) => {
-                    let due = self.synced_at.elapsed() >= SYNC_EVERY;
+                    let due = is_sync_due(self.synced_at.elapsed(), !self.shared.asked().is_empty());
                     if let Err(error) = self.write(due) {
                         self.complain(&error);
                     }
@@ -406,5 +415,17 @@ impl Worker {
             .map(ToString::to_string)
             .unwrap_or_default();
         tracing::error!(%error, source, "last records wait in memory");
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_record_that_somebody_waits_for_goes_to_the_disk_with_the_next_write() {
+        assert!(is_sync_due(Duration::ZERO, true));
+        assert!(!is_sync_due(Duration::ZERO, false));
+        assert!(!is_sync_due(SYNC_EVERY - Duration::from_millis(1), false) && is_sync_due(SYNC_EVERY, false));
     }
 }

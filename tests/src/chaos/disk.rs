@@ -112,7 +112,7 @@ impl Drop for Disk {
 
 #[cfg(test)]
 mod tests {
-    #![allow(clippy::unwrap_used, clippy::print_stderr, reason = "tests")]
+    #![allow(clippy::unwrap_used, clippy::panic, clippy::print_stderr, reason = "tests")]
 
     use super::*;
 
@@ -121,8 +121,9 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let disk = match Disk::mount(&folder.path().join("data"), 1024 * 1024) {
             Ok(disk) => disk,
+            Err(error) if rustix::process::getuid().is_root() => panic!("as root it must work: {error}"),
             Err(error) => {
-                eprintln!("not tested, mounting is not permitted here: {error}");
+                eprintln!("NOT RUN: only root may mount a small disk: {error}");
                 return;
             }
         };

@@ -12,6 +12,7 @@ use serde_json::{Value, json};
 use crate::{
     Api, Cell, Error, HostProcess, PLANT,
     chaos::{
+        dates,
         operator::unix_ns,
         relay::Way,
         schedule::{Fault, Kind},
@@ -27,6 +28,10 @@ const SILENCE_MS_MAX: u64 = 1_500;
 const ANSWER_MAX: Duration = Duration::from_secs(5);
 /// Delays of a slow link, in ms, least and greatest.
 const DELAY_MS: (u64, u64) = (2, 60);
+/// Bytes a second that a narrow link carries, least and greatest: some hundredths of what a host of twenty loops is sent.
+const NARROW_BYTES_PER_S: (u64, u64) = (10_000, 100_000);
+/// Hours that the date of a host without points is stepped by, at most.
+const HOURS_MAX: u64 = 23;
 /// Days that a date is moved by, at most.
 const DAYS_MAX: u64 = 300;
 
@@ -60,7 +65,8 @@ impl Inflictor {
             Kind::Cut | Kind::CutOneWay if self.cell.net().is_none() && self.cell.relay.is_none() => {
                 Err("no network namespaces and no relay")
             }
-            Kind::Delay | Kind::Loss if self.cell.relay.is_none() => Err("no relay"),
+            Kind::Delay | Kind::Loss | Kind::Narrow if self.cell.relay.is_none() => Err("no relay"),
+            Kind::ClockStep if !self.cell.dates() => Err("no libfaketime (Debian: faketime)"),
             Kind::DiskFull if self.cell.disks.is_empty() => Err("no small disk"),
             _ => Ok(()),
         }
@@ -117,6 +123,23 @@ impl Inflictor {
                 ))
             }
             Kind::Loss => Ok(self.lose(fault, lasts)),
+            Kind::Narrow => {
+                let bytes_per_s = self.narrow(fault.choice);
+                pause(lasts);
+                self.widen();
+                Ok(format!(
+                    "{bytes_per_s} bytes/s each way between {PLANT} and {}, for {lasts:?}",
+                    self.relayed()
+                ))
+            }
+            Kind::ClockStep => {
+                let there = self.step_dates(fault.choice)?;
+                pause(lasts);
+                let back = self.step_dates(fault.choice.rotate_right(17))?;
+                // Until the means has seen it.
+                pause(Duration::from_millis(1_500));
+                Ok(format!("{there}; {lasts:?} later {back}"))
+            }
             Kind::DiskFull => {
                 let names: Vec<String> = self.cell.disks.keys().cloned().collect();
                 let place = usize::try_from(fault.choice % names.len().max(1) as u64).unwrap_or(0);
@@ -167,20 +190,7 @@ impl Inflictor {
                 self.cell.plant.resume()?;
                 Ok(format!("for {lasts:?}"))
             }
-            Kind::Together => {
-                let frozen = self.controller(fault.victim + 1);
-                self.slow(Duration::from_millis(DELAY_MS.1));
-                self.cell.host(&frozen)?.pause()?;
-                self.cell.host(&victim)?.kill9();
-                pause(lasts);
-                self.cell.host(&frozen)?.resume()?;
-                self.slow(Duration::ZERO);
-                self.cell.restart(&victim)?;
-                Ok(format!(
-                    "{victim} killed, {frozen} stopped for {lasts:?}, {} far away",
-                    self.relayed()
-                ))
-            }
+            Kind::Together => self.together(fault, lasts),
             Kind::AllDead => {
                 for host in self.cell.hosts_mut() {
                     host.kill9();
@@ -193,6 +203,127 @@ impl Inflictor {
                 Ok(format!("for {lasts:?} and their starts"))
             }
         }
+    }
+
+    /// Several at once, each on a host of its own; then all of them are undone, the network first and the home last.
+    fn together(&mut self, fault: &Fault, lasts: Duration) -> Result<String, Error> {
+        let possible: Vec<Part> = Part::ALL
+            .into_iter()
+            .filter(|part| match part {
+                Part::Cut => self.cell.net().is_some(),
+                Part::Slow | Part::Narrow => self.cell.relay.is_some(),
+                Part::Disk => self.cell.disks.keys().any(|host| host != PLANT),
+                Part::Dates => self.cell.dates(),
+                Part::Home | Part::Kill | Part::Pause => true,
+            })
+            .collect();
+        let (killed, frozen) = (self.controller(fault.victim), self.controller(fault.victim + 1));
+        let apart = self.controller(fault.victim + 2);
+        let others: Vec<String> = self.cell.hosts().map(|host| host.name.clone()).collect();
+        let chosen = parts(fault.choice, &possible);
+        let mut words = Vec::new();
+        for part in &chosen {
+            words.push(match part {
+                Part::Home => {
+                    self.cell.plant.kill9();
+                    format!("{PLANT} killed")
+                }
+                Part::Kill => {
+                    self.cell.host(&killed)?.kill9();
+                    format!("{killed} killed")
+                }
+                Part::Pause => {
+                    self.cell.host(&frozen)?.pause()?;
+                    format!("{frozen} stopped")
+                }
+                Part::Cut => {
+                    for other in others.iter().filter(|other| **other != apart) {
+                        self.block(&apart, other, true)?;
+                        self.block(other, &apart, true)?;
+                    }
+                    format!("{apart} cut off")
+                }
+                Part::Slow => {
+                    self.slow(Duration::from_millis(DELAY_MS.1));
+                    format!("{} far away", self.relayed())
+                }
+                Part::Narrow => {
+                    let bytes_per_s = self.narrow(fault.choice);
+                    format!("{bytes_per_s} bytes/s for {}", self.relayed())
+                }
+                Part::Disk => {
+                    // Not the home's: what is told while its disk is full rests on others, who may be the ones that are killed.
+                    let full = self.cell.disks.iter().find(|(host, _)| *host != PLANT);
+                    if let Some((_, disk)) = full {
+                        disk.fill()?;
+                    }
+                    format!("disk of {} full", full.map_or("nobody", |(host, _)| host.as_str()))
+                }
+                Part::Dates => self.step_dates(fault.choice)?,
+            });
+        }
+        pause(lasts);
+        for part in chosen.iter().rev() {
+            match part {
+                Part::Home => self.cell.restart(PLANT)?,
+                Part::Kill => self.cell.restart(&killed)?,
+                Part::Pause => self.cell.host(&frozen)?.resume()?,
+                Part::Cut => {
+                    for other in others.iter().filter(|other| **other != apart) {
+                        self.block(&apart, other, false)?;
+                        self.block(other, &apart, false)?;
+                    }
+                }
+                Part::Slow => self.slow(Duration::ZERO),
+                Part::Narrow => self.widen(),
+                Part::Disk => {
+                    if let Some((_, disk)) = self.cell.disks.iter().find(|(host, _)| *host != PLANT) {
+                        disk.free()?;
+                    }
+                }
+                // Dates stay as they are: nobody may care.
+                Part::Dates => {}
+            }
+        }
+        Ok(format!("{}, for {lasts:?}", words.join(", ")))
+    }
+
+    fn narrow(&self, choice: u64) -> u64 {
+        let (low, high) = NARROW_BYTES_PER_S;
+        let bytes_per_s = low + choice % (high - low);
+        if let Some(relay) = &self.cell.relay {
+            relay.narrow(Way::Away, Some(bytes_per_s));
+            relay.narrow(Way::Back, Some(bytes_per_s));
+        }
+        bytes_per_s
+    }
+
+    fn widen(&self) {
+        if let Some(relay) = &self.cell.relay {
+            relay.narrow(Way::Away, None);
+            relay.narrow(Way::Back, None);
+        }
+    }
+
+    /// Steps the dates of some hosts, one at least: the home's by whole days, so that its log can be read, the others' by hours.
+    fn step_dates(&self, choice: u64) -> Result<String, Error> {
+        let mut words = Vec::new();
+        let count = self.cell.hosts().count();
+        for (n, host) in self.cell.hosts().enumerate() {
+            if choice >> n & 1 == 0 && choice % count as u64 != n as u64 {
+                continue;
+            }
+            let draw = choice.rotate_right(u32::try_from(7 * (n + 1)).unwrap_or(0));
+            let (unit, unit_s, most) = if host.name == PLANT {
+                ("days", 86_400, DAYS_MAX)
+            } else {
+                ("hours", 3_600, HOURS_MAX)
+            };
+            let by = i64::try_from(draw % (2 * most + 1)).unwrap_or(0) - i64::try_from(most).unwrap_or(0);
+            dates::step(host.folder(), by * unit_s)?;
+            words.push(format!("{} {by:+} {unit}", host.name));
+        }
+        Ok(format!("dates: {}", words.join(", ")))
     }
 
     fn relayed(&self) -> &str {
@@ -335,6 +466,48 @@ impl Inflictor {
     }
 }
 
+/// What may be part of a fault of several, in the order in which it begins: deaths first, so that what is acknowledged before
+/// them was acknowledged in peace.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Part {
+    Home,
+    Kill,
+    Dates,
+    Disk,
+    Pause,
+    Cut,
+    Slow,
+    Narrow,
+}
+
+impl Part {
+    const ALL: [Self; 8] = [
+        Self::Home,
+        Self::Kill,
+        Self::Dates,
+        Self::Disk,
+        Self::Pause,
+        Self::Cut,
+        Self::Slow,
+        Self::Narrow,
+    ];
+}
+
+/// Those that the bits of a free choice name, three at least, in their order.
+fn parts(choice: u64, possible: &[Part]) -> Vec<Part> {
+    let named = |n: usize| choice >> n & 1 == 1;
+    let missing = 3_usize.saturating_sub((0..possible.len()).filter(|n| named(*n)).count());
+    let mut more: Vec<usize> = (0..possible.len()).filter(|n| !named(*n)).collect();
+    let turn = usize::try_from(choice >> 32).unwrap_or(0) % more.len().max(1);
+    more.rotate_left(turn);
+    more.truncate(missing);
+    let chosen = possible
+        .iter()
+        .enumerate()
+        .filter(|(n, _)| named(*n) || more.contains(n));
+    chosen.map(|(_, part)| *part).collect()
+}
+
 /// Has the loop an owner, all its members, and a record of now?
 fn runs(row: &Value) -> bool {
     let members = row["members"].as_array().map_or(0, Vec::len) as u64;
@@ -349,4 +522,23 @@ fn move_date(host: &mut HostProcess, choice: u64) -> i64 {
     let days = i64::try_from(choice % (2 * DAYS_MAX + 1)).unwrap_or(0) - i64::try_from(DAYS_MAX).unwrap_or(0);
     host.set_head(format!("clock_offset_s = {}\n", days * 86_400));
     days
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn at_least_three_happen_at_once_and_every_one_some_time() {
+        let mut seen = Vec::new();
+        for choice in 0..256_u64 {
+            let chosen = parts(choice | choice << 32, &Part::ALL);
+            assert!(chosen.len() >= 3, "{choice:b}: {chosen:?}");
+            let place = |part: &Part| Part::ALL.iter().position(|p| p == part);
+            assert!(chosen.is_sorted_by_key(place), "{chosen:?}");
+            seen.extend(chosen);
+        }
+        assert!(Part::ALL.iter().all(|part| seen.contains(part)));
+        assert_eq!(parts(0, &[Part::Kill, Part::Pause]).len(), 2, "as many as there are");
+    }
 }

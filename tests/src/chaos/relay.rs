@@ -1,10 +1,11 @@
-//! A bad network between two hosts: a TCP relay that holds back, stalls or breaks what passes.
+//! A bad network between two hosts: a TCP relay that holds back, stalls, narrows or breaks what passes.
 //!
 //! ```text
 //! host c ══ TCP ══► relay ══ TCP ══► host a     away: from who connected
 //! host c ◄═ TCP ═══ relay ◄═ TCP ═══ host a     back: to who connected
 //! ```
-//! A packet that is lost on a TCP link is a stall of everything behind it until it is sent again; that is what `stall` does.
+//! A narrow link takes so many bytes a second and keeps few; whoever sends more finds it full, as behind a switch that carries
+//! other traffic. A packet that is lost on a TCP link is a stall of everything behind it until it is sent again; that is what `stall` does.
 //! Never: loses, reorders or changes bytes of a link that lives.
 
 use std::{
@@ -24,6 +25,10 @@ use crate::{Error, pause};
 const CHUNK_BYTES: usize = 64 * 1024;
 /// Chunks that may wait in one direction; beyond it the reader waits, and so does the sender.
 const CHUNKS_MAX: usize = 4096;
+/// Bytes that wait at a narrow link; beyond it the sender finds it full: what a small switch keeps for a port.
+const NARROW_BYTES_MAX: u64 = 32 * 1024;
+/// Bytes that a narrow link takes at once, so that a large message does not pass in one leap.
+const NARROW_SLICE_BYTES: usize = 1024;
 /// Links at once: a host has one or two.
 const LINKS_MAX: usize = 64;
 /// Pause between two looks whether a stall is over.
@@ -45,6 +50,9 @@ struct Lane {
     delay_us: AtomicU64,
     stalled: AtomicBool,
     bytes: AtomicU64,
+    /// Bytes a second; 0 for as many as come.
+    bytes_per_s: AtomicU64,
+    waiting_bytes: AtomicU64,
 }
 
 #[derive(Debug, Default)]
@@ -122,6 +130,12 @@ impl Relay {
         self.shared.lane(way).stalled.store(stalled, Ordering::Relaxed);
     }
 
+    /// Lets only so many bytes a second pass that way from now on; none for as many as come.
+    pub fn narrow(&self, way: Way, bytes_per_s: Option<u64>) {
+        let bytes_per_s = bytes_per_s.map_or(0, |bytes| bytes.max(1));
+        self.shared.lane(way).bytes_per_s.store(bytes_per_s, Ordering::Relaxed);
+    }
+
     /// Breaks all links; new ones may be made.
     pub fn reset(&self) {
         self.shared.break_links();
@@ -171,23 +185,31 @@ fn link(near: TcpStream, to: SocketAddr, shared: &Arc<Shared>) {
 fn carry(mut from: TcpStream, to: TcpStream, way: Way, shared: &Arc<Shared>) {
     let (sender, waiting) = sync_channel::<(Instant, Vec<u8>)>(CHUNKS_MAX);
     let (of_reader, of_writer) = (Arc::clone(shared), Arc::clone(shared));
-    let reader = move || read(&mut from, &sender, of_reader.lane(way));
+    let reader = move || read(&mut from, &sender, of_reader.lane(way), &of_reader.ended);
     let writer = move || write(to, &waiting, of_writer.lane(way), &of_writer.ended);
     // Where there are no threads the link falls silent, which is a fault like others.
     let _reader = std::thread::Builder::new().name("relay-in".to_owned()).spawn(reader);
     let _writer = std::thread::Builder::new().name("relay-out".to_owned()).spawn(writer);
 }
 
-fn read(from: &mut TcpStream, sender: &SyncSender<(Instant, Vec<u8>)>, lane: &Lane) {
+fn read(from: &mut TcpStream, sender: &SyncSender<(Instant, Vec<u8>)>, lane: &Lane, ended: &AtomicBool) {
     let mut chunk = vec![0; CHUNK_BYTES];
     while let Ok(count) = from.read(&mut chunk) {
         let Some(bytes) = chunk.get(..count).filter(|bytes| !bytes.is_empty()) else {
             return;
         };
         lane.bytes.fetch_add(count as u64, Ordering::Relaxed);
+        lane.waiting_bytes.fetch_add(count as u64, Ordering::Relaxed);
         let delay = Duration::from_micros(lane.delay_us.load(Ordering::Relaxed));
         if sender.send((Instant::now() + delay, bytes.to_vec())).is_err() {
             return;
+        }
+        // What is not read fills the sender's own queue.
+        while lane.bytes_per_s.load(Ordering::Relaxed) > 0
+            && lane.waiting_bytes.load(Ordering::Relaxed) > NARROW_BYTES_MAX
+            && !ended.load(Ordering::Relaxed)
+        {
+            pause(LOOK);
         }
     }
 }
@@ -198,12 +220,36 @@ fn write(mut to: TcpStream, waiting: &Receiver<(Instant, Vec<u8>)>, lane: &Lane,
         while lane.stalled.load(Ordering::Relaxed) && !ended.load(Ordering::Relaxed) {
             pause(LOOK);
         }
-        if to.write_all(&bytes).is_err() {
+        let written = send(&mut to, &bytes, lane);
+        lane.waiting_bytes.fetch_sub(bytes.len() as u64, Ordering::Relaxed);
+        if written.is_err() {
             break;
         }
     }
+    // What a link that broke had not passed on waits no longer.
+    for (_, bytes) in waiting.try_iter() {
+        lane.waiting_bytes.fetch_sub(bytes.len() as u64, Ordering::Relaxed);
+    }
     // The other side hears that this one has gone.
     let _closed = to.shutdown(Shutdown::Both);
+}
+
+/// Writes at the pace that the link has now.
+fn send(to: &mut TcpStream, bytes: &[u8], lane: &Lane) -> std::io::Result<()> {
+    let mut rest = bytes;
+    while !rest.is_empty() {
+        let bytes_per_s = lane.bytes_per_s.load(Ordering::Relaxed);
+        let slice = if bytes_per_s == 0 {
+            std::mem::take(&mut rest)
+        } else {
+            let (slice, more) = rest.split_at(rest.len().min(NARROW_SLICE_BYTES));
+            rest = more;
+            pause(Duration::from_secs_f64(slice.len() as f64 / bytes_per_s as f64));
+            slice
+        };
+        to.write_all(slice)?;
+    }
+    Ok(())
 }
 
 #[cfg(test)]
@@ -243,6 +289,25 @@ mod tests {
             assert!(sent.elapsed() >= delay);
         }
         assert_eq!((relay.bytes(Way::Away), relay.bytes(Way::Back)), (8, 8));
+    }
+
+    #[test]
+    fn a_narrow_link_passes_everything_at_its_pace() {
+        let relay = Relay::start(Ipv4Addr::LOCALHOST.into(), echo()).unwrap();
+        let mut stream = TcpStream::connect(relay.address).unwrap();
+        let text: Vec<u8> = (0..4096_u32).map(|n| (n % 251) as u8).collect();
+        relay.narrow(Way::Away, Some(40_000));
+        let sent = Instant::now();
+        stream.write_all(&text).unwrap();
+        let mut bytes = vec![0; text.len()];
+        stream.read_exact(&mut bytes).unwrap();
+        assert_eq!(bytes, text);
+        // Never earlier; how much later is the machine's business.
+        assert!(sent.elapsed() >= Duration::from_millis(100));
+        relay.narrow(Way::Away, None);
+        stream.write_all(b"wide").unwrap();
+        stream.read_exact(&mut bytes[..4]).unwrap();
+        assert_eq!(&bytes[..4], b"wide");
     }
 
     #[test]

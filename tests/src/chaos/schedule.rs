@@ -17,10 +17,14 @@ pub enum Kind {
     Delay,
     /// The same link stalls again and again as TCP does when packets are lost, and breaks once.
     Loss,
+    /// The same link carries too little for what is sent over it: what finds no room is dropped.
+    Narrow,
     /// The disk of a host is full for a while.
     DiskFull,
     /// A host stops in good order and starts with its date days off.
     Date,
+    /// The dates of some hosts step by hours or days, forth and back, while they run.
+    ClockStep,
     /// A host is drained and put back into service.
     Drain,
     /// A host stops in good order (SIGTERM) and starts again.
@@ -29,7 +33,8 @@ pub enum Kind {
     HomeKill,
     /// SIGSTOP of the home, then SIGCONT.
     HomePause,
-    /// A kill, a pause and a slow link at once, on different hosts.
+    /// At least three at once, on different hosts, of: the home's kill, another's kill, a pause, a cut, a slow or a narrow
+    /// link, a full disk, stepped dates.
     Together,
     /// `kill -9` of every host at once.
     AllDead,
@@ -37,15 +42,17 @@ pub enum Kind {
 
 impl Kind {
     /// All of them.
-    pub const ALL: [Self; 14] = [
+    pub const ALL: [Self; 16] = [
         Self::Kill,
         Self::Pause,
         Self::Cut,
         Self::CutOneWay,
         Self::Delay,
         Self::Loss,
+        Self::Narrow,
         Self::DiskFull,
         Self::Date,
+        Self::ClockStep,
         Self::Drain,
         Self::Stop,
         Self::HomeKill,
@@ -64,8 +71,10 @@ impl Kind {
             Self::CutOneWay => "cut-one-way",
             Self::Delay => "delay",
             Self::Loss => "loss",
+            Self::Narrow => "narrow",
             Self::DiskFull => "disk-full",
             Self::Date => "date",
+            Self::ClockStep => "clock-step",
             Self::Drain => "drain",
             Self::Stop => "stop",
             Self::HomeKill => "home-kill",
@@ -81,7 +90,9 @@ impl Kind {
             Self::Kill | Self::Date | Self::Stop => (1, 2_000),
             Self::Pause => (1, 60_000),
             Self::Cut | Self::CutOneWay => (20, 20_000),
-            Self::Delay | Self::Loss | Self::DiskFull => (1_000, 6_000),
+            Self::Delay | Self::Loss | Self::Narrow | Self::DiskFull => (1_000, 6_000),
+            // The means needs a second to be felt.
+            Self::ClockStep => (2_500, 5_000),
             Self::Drain => (500, 2_000),
             Self::HomeKill | Self::AllDead => (1, 500),
             Self::HomePause => (5, 5_000),
@@ -189,7 +200,7 @@ mod tests {
         let course = |seed| -> Vec<Fault> { Schedule::new(seed, &Kind::ALL, 60_000, (500, 900)).take(70).collect() };
         assert_eq!(course(7), course(7));
         assert_ne!(course(7), course(8));
-        for round in course(7).chunks(Kind::ALL.len()) {
+        for round in course(7).chunks_exact(Kind::ALL.len()) {
             let mut kinds: Vec<Kind> = round.iter().map(|fault| fault.kind).collect();
             kinds.sort_unstable();
             assert_eq!(kinds, Kind::ALL);

@@ -152,7 +152,7 @@ proptest! {
     #[test]
     fn any_bytes_on_any_lane_are_read_or_refused(bytes in prop::collection::vec(any::<u8>(), 0..200)) {
         let lanes = Lane::ALL.into_iter().map(direct);
-        let news = ["record/p", "vitals/b", "notice/b", "alive/b/0"].map(|tail| format!("bumpless/mill/{tail}"));
+        let news = ["record/p", "vitals/b", "notice/b", "alive/b/0", "claim/b"].map(|tail| format!("bumpless/mill/{tail}"));
         for key in lanes.chain(news) {
             let _ = read_bytes(&key, &bytes);
             let _ = read_bytes(&key, &[&[wire::VERSION], bytes.as_slice()].concat());

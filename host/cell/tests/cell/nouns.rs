@@ -9,7 +9,7 @@ use bumpless_core::redundancy::{Aside, Redundancy, Standing};
 use bumpless_core::{
     AlarmChange, Applied, Command, CommandBody, CommandId, Cycle, Digest, Effects, Event, Fault, Frame, HostId,
     LogLevel, LogLine, LoopId, Message, Mode, NoData, Outcome, Priority, Reading, Record,
-    protocol::{Answer, Sample, StepAnswer, StepRequest},
+    protocol::{Answer, Sample, StepAnswer, StepRequest, Switch},
 };
 
 /// A host's name.
@@ -201,6 +201,7 @@ pub(crate) fn step_request(from: &HostId, correlation: u64) -> StepRequest {
             messages: messages(),
         },
         state: Arc::from([9, 8, 7]),
+        switch: Some(Switch { from: 35, to: 36 }),
     }
 }
 

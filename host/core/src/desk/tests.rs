@@ -120,6 +120,67 @@ fn a_silent_owner_is_replaced_within_the_period_and_fenced() {
     );
 }
 
+/// Makes host 0 the owner of a cycle at this time and lets it be silent; host 1 takes over. Gives when it was struck.
+fn silent(desk: &mut Desk, at_ns: u64) -> u64 {
+    desk.set_members(at_ns, vec![host(0)]);
+    let at_ns = at_ns.max(desk.deadline_at_ns());
+    let first = sent(desk.deadline(at_ns, vec![], None).map(|d| d.1));
+    assert_eq!(first.owner, host(0), "where no other is left it is asked all the same");
+    desk.set_members(at_ns, vec![host(0), host(1)]);
+    let struck_ns = desk.due_at_ns();
+    let again = sent(desk.overdue(struck_ns));
+    assert_eq!(again.owner, host(1));
+    desk.check(&commit(&again)).unwrap();
+    desk.take(struck_ns, commit(&again));
+    struck_ns
+}
+
+/// Would a host that has no strikes be preferred to host 0 at this time?
+fn passed_over(desk: &Desk, at_ns: u64) -> bool {
+    let mut desk = desk.clone();
+    desk.set_members(at_ns, vec![host(0), host(2)]);
+    let sample = sent(desk.deadline(at_ns, vec![], None).map(|d| d.1));
+    sample.owner == host(2)
+}
+
+#[test]
+fn who_is_silent_again_and_again_is_passed_over_twice_as_long_and_a_minute_at_most() {
+    let mut desk = desk();
+    let (mut at_ns, mut times_s) = (0, Vec::new());
+    for _ in 0..9 {
+        let struck_ns = silent(&mut desk, at_ns);
+        let for_ns = [1, 2, 4, 8, 16, 32, 60]
+            .map(|s| s * 1_000_000_000)
+            .into_iter()
+            .find(|ns| !passed_over(&desk, struck_ns + ns))
+            .unwrap();
+        assert!(passed_over(&desk, struck_ns + for_ns - 1), "to the last nanosecond");
+        times_s.push(for_ns / 1_000_000_000);
+        at_ns = struck_ns + for_ns;
+    }
+    assert_eq!(times_s, [1, 2, 4, 8, 16, 32, 60, 60, 60]);
+
+    // One cycle that it ran, and all is forgiven.
+    let mut forgiven = desk.clone();
+    forgiven.set_members(at_ns, vec![host(0)]);
+    let good = sent(forgiven.deadline(at_ns, vec![], None).map(|d| d.1));
+    forgiven.check(&commit(&good)).unwrap();
+    forgiven.take(at_ns + 1, commit(&good));
+    let struck_ns = silent(&mut forgiven, at_ns + PERIOD_NS);
+    assert!(!passed_over(&forgiven, struck_ns + 1_000_000_000), "a second again");
+
+    // So it is after a minute in which nobody had to ask it.
+    let later_ns = at_ns + SUSPECT_NS_MAX;
+    let mut remembered = desk.clone();
+    let struck_ns = silent(&mut remembered, later_ns - 1);
+    assert!(
+        passed_over(&remembered, struck_ns + SUSPECT_NS_MAX - 1),
+        "not yet forgotten"
+    );
+    let struck_ns = silent(&mut desk, later_ns);
+    assert!(!passed_over(&desk, struck_ns + 1_000_000_000), "forgotten");
+}
+
 #[test]
 fn a_dead_owner_is_replaced_at_once_and_between_cycles() {
     let mut desk = desk();
