@@ -361,6 +361,7 @@ impl Cell {
             Message::Answer(answer) => match *answer {
                 Answer::Commit(record) => self.commit(state, *record),
                 Answer::Held { term, seq, .. } => state.told((term, seq)),
+                Answer::NeedRecord { .. } if self.broken == Some(Broken::NoResume) => {}
                 other => {
                     let dispatch = state.desk.answered(state.now_ns, &other);
                     self.send(state, dispatch);

@@ -185,6 +185,7 @@ pub const REMOVALS: [Removal; 7] = [
         bounds: Bounds {
             losses: 1,
             crashes: 1,
+            cycles: 1,
             ..QUIET
         },
         broken: Broken::NoResume,

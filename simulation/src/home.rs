@@ -263,7 +263,7 @@ impl World {
 
     /// An owner or a member says something.
     pub(crate) fn answer(&mut self, host: u32, answer: Answer) {
-        let number = law::loop_number(answer.loop_id());
+        let (number, broken) = (law::loop_number(answer.loop_id()), self.broken());
         let local_ns = self.host(host).clock.shows(self.now_ns);
         let Some(l) = self.loops.get_mut(number as usize).filter(|l| l.home == host) else {
             return;
@@ -277,6 +277,7 @@ impl World {
                 let life = self.host(by).life;
                 self.kept(number, (term, seq), Keeper::Member { host: by, life });
             }
+            Answer::NeedRecord { .. } if broken == Some(Broken::NoResume) => {}
             other => {
                 let Some(desk) = l.desk.as_mut() else { return };
                 let before = desk.tally();
