@@ -18,8 +18,9 @@ interface Message {
 export const messages = signal<Message[]>([]);
 let next_message = 1;
 
-/** How long a message stays, in ms; bad ones stay until they are closed. */
+/** How long a message stays, in ms, and one that offers to take something back; bad ones stay until they are closed. */
 const MESSAGE_MS = 10_000;
+const UNDO_MS = 30_000;
 
 export function say(text: string, undo?: () => Promise<unknown>): void {
   put({ id: next_message++, text, bad: false, undo });
@@ -31,7 +32,7 @@ export function complain(error: unknown): void {
 
 function put(message: Message): void {
   messages.value = [...messages.value.slice(-3), message];
-  if (!message.bad) setTimeout(() => drop(message.id), MESSAGE_MS);
+  if (!message.bad) setTimeout(() => drop(message.id), message.undo ? UNDO_MS : MESSAGE_MS);
 }
 
 function drop(id: number): void {
