@@ -18,5 +18,5 @@ export default defineConfig({
     },
   },
   // For work on the page: the API of a host that runs.
-  server: { proxy: { "/v1": process.env.BUMPLESS_API ?? "http://127.0.0.1:8480" } },
+  server: { proxy: Object.fromEntries(["/v1", "/openapi.json", "/addresses"].map((path) => [path, process.env.BUMPLESS_API ?? "http://127.0.0.1:8480"])) },
 });

@@ -133,5 +133,20 @@ pub const TREND_NOTICES_MAX: usize = 500;
 /// Most pieces that a window of curves is told in: a wide screen has no more columns.
 pub const TREND_POINTS_MAX: usize = 4_000;
 
+/// Bytes of a report of the lab that are shown: a page with curves of some dozen cases has a few million.
+pub const REPORT_BYTES_MAX: u64 = 32 * 1024 * 1024;
+
+/// Reports of one answer; older ones are counted.
+pub const REPORTS_MAX: usize = 200;
+
+/// Entries of the folder of reports that are looked at: a mistaken path to a large folder must not hold the answer up.
+pub const REPORT_ENTRIES_MAX: usize = 10_000;
+
+/// Characters of a report's file name.
+pub const REPORT_NAME_MAX: usize = 128;
+
+/// News of points and jobs in one beat of a feed in rows; more are left out and counted, and the reader asks for the points again.
+pub const FIELD_NEWS_AT_ONCE: usize = 100;
+
 /// Longest time that a fault of the demonstration lasts, in s.
 pub const FAULT_S_MAX: u32 = 60;

@@ -8,7 +8,9 @@ use utoipa::OpenApi;
 
 use crate::{
     error::Problem,
-    routes::{alarms, bundle, components, demo, field, health, history, hosts, live, loops, pages, rollouts, trend},
+    routes::{
+        alarms, bundle, components, demo, field, health, history, hosts, lab, live, loops, pages, rollouts, trend,
+    },
     types,
 };
 
@@ -28,12 +30,12 @@ use crate::{
         history::start_shadow, history::shadows, history::show_shadow, history::stop_shadow,
         rollouts::start, rollouts::list, rollouts::show, rollouts::stop,
         alarms::list, alarms::past, alarms::show, alarms::act, alarms::define, alarms::remove,
-        hosts::list, health::of_host, hosts::drain, hosts::undrain, hosts::points, live::feed, trend::trend, trend::list_notices, demo::show, demo::fault,
+        hosts::list, health::of_host, hosts::drain, hosts::undrain, hosts::points, live::feed, trend::trend, trend::list_notices, demo::show, demo::fault, lab::list, lab::show,
         field::point, field::write, field::force, field::unforce, field::buses,
         field::start, field::jobs, field::job, field::cancel,
         health::livez, health::readyz, pages::metrics, pages::openapi,
     ),
-    components(schemas(Problem, types::Record, types::Hosts, types::LiveRows, types::Standing, types::FieldNews, live::Form)),
+    components(schemas(Problem, types::Record, types::Hosts, types::LiveRows, types::Standing, types::FieldNews, types::LiveField, live::Form)),
     tags(
         (name = "components", description = "The library of control components"),
         (name = "loops", description = "Controllers bound to points"),
@@ -43,6 +45,7 @@ use crate::{
         (name = "alarms", description = "What stands, what happened, and what people do about it, by ANSI/ISA-18.2"),
         (name = "cell", description = "Hosts, points and the live feed"),
         (name = "field", description = "Points by hand, forces, buses, and jobs: what takes long is acknowledged at once and told of later"),
+        (name = "lab", description = "Reports of experiments, where the host has a folder of them"),
         (name = "operation", description = "For supervisors and monitoring"),
     )
 )]

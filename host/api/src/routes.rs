@@ -10,6 +10,7 @@ pub(crate) mod field;
 pub(crate) mod health;
 pub(crate) mod history;
 pub(crate) mod hosts;
+pub(crate) mod lab;
 pub(crate) mod live;
 pub(crate) mod loops;
 pub(crate) mod page;
@@ -88,6 +89,8 @@ pub(crate) fn all() -> Router<App> {
         .route("/v1/live", get(live::feed))
         .route("/v1/loops/{name}/trend", get(trend::trend))
         .route("/v1/notices", get(trend::list_notices))
+        .route("/v1/lab/reports", get(lab::list))
+        .route("/v1/lab/reports/{file}", get(lab::show))
         .route("/v1/demo", get(demo::show))
         .route("/v1/demo/faults", post(demo::fault))
         .route("/metrics", get(pages::metrics))

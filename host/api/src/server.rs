@@ -8,6 +8,7 @@
 use std::{
     future::Future,
     panic::AssertUnwindSafe,
+    path::PathBuf,
     sync::{Arc, Mutex, PoisonError},
     time::{Duration, Instant},
 };
@@ -52,6 +53,8 @@ pub struct Options {
     pub requests_max: usize,
     /// Live feeds open at once.
     pub feeds_max: usize,
+    /// Folder of the lab's reports; none where the configuration names none.
+    pub reports: Option<PathBuf>,
     /// Who does the faults that are asked for; none in service, only the demonstration has one. A full queue refuses.
     pub faults: Option<mpsc::Sender<Fault>>,
     /// What the host measures, where somebody else reads it too; else the server makes its own.
@@ -63,6 +66,7 @@ impl Default for Options {
         Self {
             requests_max: REQUESTS_MAX,
             feeds_max: FEEDS_MAX,
+            reports: None,
             faults: None,
             metrics: None,
         }
@@ -91,6 +95,8 @@ pub(crate) struct App {
     pub(crate) keys: Arc<Keys>,
     /// Held from the look at a tag to the change that relies on it; changes without a condition pass by.
     pub(crate) conditional: Arc<tokio::sync::Mutex<()>>,
+    /// Folder of the lab's reports.
+    pub(crate) reports: Option<PathBuf>,
     /// Who does the faults of the demonstration.
     pub(crate) faults: Option<mpsc::Sender<Fault>>,
     requests: Arc<Semaphore>,
@@ -112,6 +118,7 @@ impl App {
             standing: Arc::default(),
             keys: Arc::default(),
             conditional: Arc::default(),
+            reports: options.reports.clone(),
             faults: options.faults.clone(),
             stop,
             cell,

@@ -9,6 +9,7 @@ pub(crate) mod fake;
 mod field;
 mod history;
 mod hosts;
+mod lab;
 mod library;
 mod metrics;
 mod page;

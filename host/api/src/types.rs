@@ -11,6 +11,7 @@ mod component;
 mod field;
 mod history;
 mod hosts;
+mod lab;
 mod library;
 mod live;
 mod loops;
@@ -35,8 +36,9 @@ pub use history::{
     ShadowRequest, Shadows, Skipped, StepTimes, Trial, TrialVerdict,
 };
 pub use hosts::{Alive, Drain, DrainRequest, Health, HealthCheck, Host, Hosts, Point, Points};
+pub use lab::{LabReport, LabReports};
 pub use library::{Admission, AdmissionFinding, ComponentEvent, ComponentHost, Import, Imports, RelabelRequest};
-pub use live::{LiveRow, LiveRows, Notice, Notices, Standing, Trend, Weight};
+pub use live::{LiveField, LiveRow, LiveRows, Notice, Notices, Standing, Trend, Weight};
 pub use loops::{
     Apply, Command, Failure, HandOver, Loop, LoopDraft, Loops, ModeRequest, MoveRequest, OutputLimit, OutputRequest,
     Policy, RollbackRequest, SetRequest, SetpointRequest, SwapRequest, Tally,

@@ -224,6 +224,7 @@ pub async fn run(config: Config, faults: Option<mpsc::Sender<Fault>>) -> Result<
     options.faults = faults;
     let metrics = bumpless_api::Metrics::of(&deploy);
     options.metrics = Some(Arc::clone(&metrics));
+    options.reports.clone_from(&config.lab_reports);
     let serving = bumpless_api::serve(listener, deploy.clone(), options, stopped);
     let api_task = tokio::spawn(serving);
     Ok(Running {

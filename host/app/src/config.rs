@@ -25,6 +25,9 @@
 //! every_s = 15                     # between two sendings of metrics
 //! headers = {}                     # such as a collector's key
 //!
+//! [lab]                            # for the operator's page
+//! reports = "lab-out"              # folder of reports; beside this file
+//!
 //! [testing]                        # a test device; only in a cell whose name begins with "test"
 //! flip_bits_every = 100            # every so-manieth step of this host comes out with a bit turned over
 //!
@@ -54,9 +57,11 @@ use bumpless_scada::ModbusServerConfig;
 use serde::{Deserialize, Serialize};
 
 mod itself;
+mod lab;
 mod testing;
 
 use crate::{error::Error, realtime::Realtime};
+use lab::LabTable;
 use testing::TestingTable;
 
 /// Bytes of a configuration file: thousands of points fit; a mistaken path to a large file does not.
@@ -95,6 +100,8 @@ pub struct Config {
     pub history_bytes_max: Option<u64>,
     /// Where metrics and traces are sent; none to send none.
     pub otlp: Option<bumpless_telemetry::Config>,
+    /// Folder of the lab's reports, for the operator's page.
+    pub lab_reports: Option<PathBuf>,
     /// Points and loops of the cell as Modbus registers.
     pub modbus_servers: Vec<ModbusServerConfig>,
 }
@@ -128,6 +135,8 @@ pub(crate) struct File {
     history: HistoryTable,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     otlp: Option<bumpless_telemetry::Config>,
+    #[serde(default)]
+    lab: LabTable,
     #[serde(default, skip_serializing_if = "TestingTable::is_empty")]
     testing: TestingTable,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
@@ -352,6 +361,7 @@ impl File {
             loops,
             history_bytes_max: self.history.checked(&wrong)?,
             otlp: self.otlp,
+            lab_reports: self.lab.reports(folder),
             modbus_servers,
         })
     }

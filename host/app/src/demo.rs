@@ -2,7 +2,7 @@
 //! controllers in the library, one loop that holds the vessel's pressure, and some tanks with a level loop each.
 //!
 //! ```text
-//! folder, ports ─► plant ready ─► a, b, c ready ─► upload ─► loop in force ─► addresses ─► watching the children
+//! folder, ports ─► plant ready ─► a, b, c ready, each behind a relay ─► upload ─► loop in force ─► addresses ─► watching the children
 //!                                                                   ├ a child dies: said, started again with --restart
 //!                                                                   └ Ctrl-C or --for: controllers, then the plant
 //! ```
@@ -10,6 +10,7 @@
 
 mod children;
 mod faults;
+mod relay;
 
 use std::{
     fs,

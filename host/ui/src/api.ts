@@ -1,6 +1,8 @@
 // Questions to the host that served the page. A failure is a Problem with its cure, never a bare status.
 // Never: another host; a page speaks to its own origin only.
 
+import { by } from "./who";
+
 /** Why a question failed, in the host's own words. */
 export class Problem extends Error {
   constructor(
@@ -15,11 +17,15 @@ export class Problem extends Error {
 
 /** Longest wait for an answer, in ms: that of the slowest route, an upload. */
 const TIME_MAX_MS = 240_000;
+/** Entries of a list that a page reads at most: nobody looks at more. */
+const LIST_MAX = 20_000;
 
 async function ask<T>(method: string, path: string, body?: BodyInit, headers: Record<string, string> = {}): Promise<T> {
   let response: Response;
   try {
-    response = await fetch(path, { method, body, headers, signal: AbortSignal.timeout(TIME_MAX_MS) });
+    // Who asks goes with what changes something. A header carries bytes; the name's are UTF-8.
+    const named = method === "GET" ? headers : { ...headers, "x-by": String.fromCharCode(...new TextEncoder().encode(by())) };
+    response = await fetch(path, { method, body, headers: named, signal: AbortSignal.timeout(TIME_MAX_MS) });
   } catch (error) {
     throw new Problem(0, "The host does not answer", String(error instanceof Error ? error.message : error), "look at the connection");
   }
@@ -52,6 +58,20 @@ export async function list<T>(path: string, rows: string): Promise<T[]> {
   return all;
 }
 
+/** The same, with the last part, for lists that tell more than their rows. */
+export async function get_list<Part extends { next?: string | null }, One>(path: string, of: (part: Part) => One[]): Promise<{ all: One[]; last: Part }> {
+  const all: One[] = [];
+  let last: Part;
+  let after = "";
+  do {
+    const query = after ? `${path.includes("?") ? "&" : "?"}after=${encodeURIComponent(after)}` : "";
+    last = await get<Part>(`${path}${query}`);
+    all.push(...of(last));
+    after = last.next ?? "";
+  } while (after && all.length < LIST_MAX);
+  return { all, last };
+}
+
 /** Also what has no body to send says that it is JSON: a page of another origin could not. */
 export const send = <T>(method: string, path: string, body: unknown, headers: Record<string, string> = {}): Promise<T> =>
   ask(method, path, JSON.stringify(body), { "content-type": "application/json", ...headers });
@@ -73,7 +93,7 @@ function key(): string {
 export function upload<T>(file: Blob, options: { note?: string; by?: string; force?: boolean; dryRun?: boolean }): Promise<T> {
   const query = new URLSearchParams();
   if (options.note) query.set("note", options.note);
-  query.set("by", options.by || "page");
+  query.set("by", options.by || by());
   if (options.force) query.set("force", "true");
   if (options.dryRun) query.set("dry_run", "true");
   return ask("POST", `/v1/components?${query}`, file, { "content-type": "application/wasm" });

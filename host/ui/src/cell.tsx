@@ -1,10 +1,11 @@
-// The cell: hosts with their load and who is how far from whom, points, events, and the faults of the demonstration.
+// The cell: hosts with their load and who is how far from whom, events, and the faults of the demonstration.
 
 import { signal } from "@preact/signals";
-import { useEffect } from "preact/hooks";
+import { useState } from "preact/hooks";
 import { send } from "./api";
-import { ago, bytes, clock, day, duration_us, value, zone } from "./format";
-import { addresses, demo, hosts, load_points, loops, notices, points, standing_alarms } from "./live";
+import { bytes, clock, day, duration_us, zone } from "./format";
+import { addresses, demo, hosts, loops, notices } from "./live";
+import { told } from "./alarms";
 import type { Host, Weight } from "./types";
 import { Act, Bar, Danger, None, say } from "./ui";
 
@@ -37,6 +38,47 @@ const fault = (host: string, what: string, seconds = 5) => async (): Promise<voi
   say(`${what} ${what === "stress" ? "the machine" : host}: asked for`);
 };
 
+/** Empties a host, or lets it take loops again. */
+function Drain({ host }: { host: Host }) {
+  const [keep, set_keep] = useState(false);
+  const path = (what: string): string => `/v1/hosts/${encodeURIComponent(host.name)}/${what}`;
+  if (host.draining) {
+    return (
+      <div class="row wrap">
+        <Act
+          class="small"
+          label={`Take loops again, ${host.name}`}
+          act={async () => {
+            await send("POST", path("undrain"), {});
+            say(`${host.name} takes loops again.`, () => send("POST", path("drain"), { keep: host.drain_kept }));
+          }}
+        >
+          Take loops again
+        </Act>
+        <small>{host.loops_owned > 0 ? `${host.loops_owned} ${host.loops_owned === 1 ? "loop has" : "loops have"} nowhere else to go yet` : "empty: it may be switched off"}{host.drain_kept ? "; stays so over restarts" : ""}</small>
+      </div>
+    );
+  }
+  return (
+    <div class="row wrap">
+      <Act
+        class="small"
+        label={`Drain ${host.name}`}
+        title="Its loops move to other hosts between two cycles; new ones stay away."
+        act={async () => {
+          const end = await send<{ loops_owned: number }>("POST", path("drain"), { keep });
+          say(end.loops_owned === 0 ? `${host.name} is empty.` : `${host.name} still owns ${end.loops_owned} loops.`, () => send("POST", path("undrain"), {}));
+        }}
+      >
+        Drain
+      </Act>
+      <label class="check">
+        <input type="checkbox" checked={keep} aria-label={`${host.name} stays empty over restarts`} onChange={(event) => set_keep(event.currentTarget.checked)} /> over restarts too
+      </label>
+    </div>
+  );
+}
+
 function HostCard({ host }: { host: Host }) {
   const roles = [host.io && "I/O", host.control && "control"].filter(Boolean).join(", ");
   const state = !host.alive ? "not alive" : host.draining ? "being emptied" : "alive";
@@ -64,6 +106,12 @@ function HostCard({ host }: { host: Host }) {
         <dd>
           owns {host.loops_owned}, holds {host.loops_held}
         </dd>
+        {host.labels?.length > 0 && (
+          <>
+            <dt>Labels</dt>
+            <dd>{host.labels.join(", ")}</dd>
+          </>
+        )}
         <dt>Version</dt>
         <dd>{host.version}</dd>
       </dl>
@@ -72,25 +120,7 @@ function HostCard({ host }: { host: Host }) {
           open its page
         </a>
       )}
-      {host.control && host.alive && addresses.value.has("/v1/hosts/{name}/drain") && (
-        <div class="row wrap">
-          {host.draining ? (
-            <Act class="small" label={`Take loops again, ${host.name}`} act={async () => {
-              await send("POST", `/v1/hosts/${host.name}/undrain`, {});
-              say(`${host.name} takes loops again.`, () => send("POST", `/v1/hosts/${host.name}/drain`, {}));
-            }}>
-              Take loops again
-            </Act>
-          ) : (
-            <Act class="small" label={`Drain ${host.name}`} title="Its loops move to other hosts between two cycles; new ones stay away." act={async () => {
-              const end = await send<{ loops_owned: number }>("POST", `/v1/hosts/${host.name}/drain`, {});
-              say(end.loops_owned === 0 ? `${host.name} is empty.` : `${host.name} still owns ${end.loops_owned} loops.`, () => send("POST", `/v1/hosts/${host.name}/undrain`, {}));
-            }}>
-              Drain
-            </Act>
-          )}
-        </div>
-      )}
+      {host.control && host.alive && addresses.value.has("/v1/hosts/{name}/drain") && <Drain host={host} />}
       {demo.value && (
         <div class="row wrap faults" role="group" aria-label={`Faults of ${host.name}`}>
           {host.alive ? (
@@ -105,6 +135,16 @@ function HostCard({ host }: { host: Host }) {
               <Act class="small" label={`Pause 5 s, ${host.name}`} act={fault(host.name, "pause")}>
                 Pause 5 s
               </Act>
+              {!host.io && (
+                <>
+                  <Act class="small" label={`Delay 10 s, ${host.name}`} title="its way to the plant is 30 ms longer, each way" act={fault(host.name, "delay", 10)}>
+                    Delay 10 s
+                  </Act>
+                  <Act class="small" label={`Lose 10 s, ${host.name}`} title="a tenth of what passes between it and the plant is lost and sent again" act={fault(host.name, "lose", 10)}>
+                    Lose 10 s
+                  </Act>
+                </>
+              )}
               <Act class="small" label={`Stress 5 s, the machine of ${host.name}`} act={fault(host.name, "stress")}>
                 Stress 5 s
               </Act>
@@ -175,71 +215,6 @@ export function Hosts() {
   );
 }
 
-const point_filter = signal("");
-
-export function Points() {
-  useEffect(() => {
-    void load_points();
-    const every = setInterval(() => void load_points(), 1_000);
-    return () => clearInterval(every);
-  }, []);
-  const wanted = point_filter.value.trim().toLowerCase();
-  const shown = [...points.value.values()].filter((point) => `${point.name} ${point.text} ${point.written_by ?? ""}`.toLowerCase().includes(wanted));
-  return (
-    <>
-      <div class="head">
-        <h1>Points</h1>
-        <p class="quiet">{points.value.size} points</p>
-        <div class="row end grow">
-          <input type="search" class="short" placeholder="filter" aria-label="Filter points" value={point_filter.value} onInput={(event) => (point_filter.value = event.currentTarget.value)} />
-        </div>
-      </div>
-      <div class="scroll" tabIndex={0} role="region" aria-label="Table of points">
-        <table class="list">
-          <thead>
-            <tr>
-              <th>Point</th>
-              <th class="num">Value</th>
-              <th>Unit</th>
-              <th>In range</th>
-              <th>Quality</th>
-              <th class="num">Age</th>
-              <th>Written by</th>
-              <th>Host, bus</th>
-            </tr>
-          </thead>
-          <tbody>
-            {shown.map((point) => (
-              <tr key={point.name}>
-                <th scope="row">
-                  {point.name}
-                  <br />
-                  <small>{point.text}</small>
-                </th>
-                <td class="num">{value(point.value, point.range[1] - point.range[0])}</td>
-                <td>{point.unit}</td>
-                <td class="barcell">
-                  <Bar label={point.name} kind={point.writable ? "out" : "pv"} at={point.value} low={point.range[0]} high={point.range[1]} unit={point.unit} />
-                </td>
-                <td class={point.quality === "bad" ? "urgent-text" : point.quality === "uncertain" ? "warn-text" : ""} title={point.reason}>
-                  {point.quality}
-                  {point.reason && <small> {point.reason}</small>}
-                </td>
-                <td class="num">{point.age_ms > 86_400_000 ? "–" : duration_us(point.age_ms * 1_000)}</td>
-                <td>{point.written_by ? <a href={`#/loop/${point.written_by}`}>{point.written_by}</a> : ""}</td>
-                <td>
-                  {point.host}, {point.bus}
-                </td>
-              </tr>
-            ))}
-          </tbody>
-        </table>
-      </div>
-      {shown.length === 0 && <None what="No points." />}
-    </>
-  );
-}
-
 const least = signal<Weight>("info");
 const event_filter = signal("");
 const ORDER: Weight[] = ["info", "warning", "urgent"];
@@ -267,20 +242,10 @@ export function Events() {
           <input type="search" class="short" placeholder="filter" aria-label="Filter events" value={event_filter.value} onInput={(event) => (event_filter.value = event.currentTarget.value)} />
         </div>
       </div>
-      {standing_alarms.value.length > 0 && (
-        <section class="panel grave" aria-label="Alarms that are raised">
-          <h2>Raised now</h2>
-          <ol class="events">
-            {standing_alarms.value.map((alarm) => (
-              <li key={alarm.number} class={alarm.weight}>
-                <time>{clock(alarm.at_unix_us / 1_000)}</time>
-                <a href={`#/loop/${alarm.loop}`}>{alarm.loop}</a>
-                <span>{alarm.text}</span>
-                <small>{ago(alarm.at_unix_us / 1_000)}</small>
-              </li>
-            ))}
-          </ol>
-        </section>
+      {told.value.length > 0 && (
+        <p class="above">
+          {told.value.length} {told.value.length === 1 ? "alarm stands or waits" : "alarms stand or wait"} for a person: <a href="#/alarms">to the alarms</a>
+        </p>
       )}
       <section class="panel" aria-label="All events">
         <ol class="events long">

@@ -1,23 +1,21 @@
 // A loop's faceplate: what an operator does with it, and what an engineer changes of it.
 
 import { useEffect, useState } from "preact/hooks";
+import { limits_of } from "./alarms";
+import { LoopAlarms } from "./alarm_parts";
 import { command, get, remove, send } from "./api";
 import { abnormal } from "./overview";
-import { ago, clock, duration_us, value, zone } from "./format";
-import { actuate, type Followed, hosts, load_points, load_specs, loops, measure, notices, points } from "./live";
+import { ago, clock, duration_us, number, value, zone } from "./format";
+import { actuate, type Followed, forced_ports, hosts, load_points, load_specs, loops, measure, notices, points } from "./live";
+import { force_words, unforce } from "./points";
+import { Redundancy, VoteState } from "./redundancy";
 import { TrendView } from "./trend";
 import type { Apply, Component, Loop, LoopDraft, Mode } from "./types";
 import { Act, Bar, complain, Danger, None, say } from "./ui";
 
-const STRATEGIES = ["round-robin", "random", "cpu", "latency", "p2c", "local", "shard"];
+const STRATEGIES = ["round-robin", "random", "cpu", "latency", "p2c", "local", "shard", "vote(3)"];
 
 const path = (loop: string, rest = ""): string => `/v1/loops/${encodeURIComponent(loop)}${rest}`;
-
-/** A number from a field, or nothing where it is none. */
-function number(text: string): number | null {
-  const x = Number(text.replace(",", ".").replace("−", "-"));
-  return text.trim() !== "" && Number.isFinite(x) ? x : null;
-}
 
 export function Face(props: { name: string }) {
   const loop = loops.value.get(props.name);
@@ -36,6 +34,7 @@ function FaceOf({ loop }: { loop: Followed }) {
     if (points.peek().size === 0) void load_points();
   }, []);
   const found = abnormal(loop);
+  const held = forced_ports(spec);
   const range = measure(spec);
   const ports = row ? Object.keys(row.outputs) : [];
   const first = actuate(spec, ports[0] ?? "");
@@ -55,17 +54,30 @@ function FaceOf({ loop }: { loop: Followed }) {
           </span>
         ))}
       </div>
+      {held.map(({ port, point }) => (
+        <div key={port} class="banner soft forced-banner" role="status">
+          <b>
+            {port} is {force_words(point)}.
+          </b>{" "}
+          <span class="quiet">{point.name}</span>
+          <Act class="small" label={`Free ${point.name}`} act={() => unforce(point)}>
+            Free
+          </Act>
+        </div>
+      ))}
       <div class="face">
         <div class="wide">
           {spec && row && (
-            <TrendView loop={loop.name} ports={ports} replicas={spec.spec.replicas} period_ms={spec.spec.period_ms} measure={range} actuate={first} />
+            <TrendView loop={loop.name} ports={ports} replicas={spec.spec.replicas} period_ms={spec.spec.period_ms} measure={range} actuate={first} limits={limits_of(loop.name)} />
           )}
           <Happened loop={loop.name} />
         </div>
         <div class="side">
           <Operate loop={loop} />
+          <LoopAlarms loop={loop.name} />
           {spec && <Run spec={spec} loop={loop} />}
           {spec && info && <Tune spec={spec} info={info} />}
+          {spec && <Redundancy key={`redundancy-${spec.revision}`} spec={spec} put={(draft) => put(spec.name, draft)} />}
           {spec && <Limits key={spec.revision} spec={spec} ports={ports} />}
           {spec && <Revisions spec={spec} />}
           {spec && <Text key={`text-${spec.revision}`} spec={spec.spec} />}
@@ -106,11 +118,11 @@ function Operate({ loop }: { loop: Followed }) {
           {value(row?.measurement, range.span)} <small>{range.unit}</small>
         </span>
         <span class="sub">
-          {spec?.measured_port ?? "pv"}
-          {row?.quality !== "good" && <b class="warn-text"> {row?.quality}</b>}
+          {spec?.measured_port ?? "pv"}{" "}
+          {row?.quality === "forced" ? <span class="tag forced">FORCED</span> : row?.quality !== "good" && <b class="warn-text"> {row?.quality}</b>}
         </span>
       </div>
-      <Bar label="measurement and setpoint" kind="pv" at={row?.measurement ?? null} mark={row?.setpoint} low={range.low} high={range.high} unit={range.unit} />
+      <Bar label="measurement and setpoint" kind="pv" at={row?.measurement ?? null} mark={row?.setpoint} low={range.low} high={range.high} unit={range.unit} limits={limits_of(loop.name)} />
       <div class="scale">
         <span>{value(range.low, range.span)}</span>
         <span>{value(range.high, range.span)}</span>
@@ -169,8 +181,9 @@ function Operate({ loop }: { loop: Followed }) {
                 <span>
                   Output {port} <b>{value(held, out.span)}</b> {out.unit}
                 </span>
+                {forced_ports(spec).some((one) => one.port === port) && <span class="tag forced">FORCED</span>}
               </div>
-              <Bar label={`output ${port}`} kind="out" at={held} low={out.low} high={out.high} unit={out.unit} />
+              <Bar label={`output ${port}`} kind="out" at={held} low={out.low} high={out.high} unit={out.unit} limits={limits_of(loop.name, port)} />
               {manual && (
                 <form
                   class="enter"
@@ -231,6 +244,7 @@ function Run({ spec, loop }: { spec: Loop; loop: Followed }) {
         <dd>
           {duration_us(row?.step_us)}, {duration_us(row?.committed_after_us)} after the deadline
         </dd>
+        <VoteState loop={spec.name} strategy={spec.spec.strategy} />
         {standing?.lost !== null && standing?.lost !== undefined && (
           <>
             <dt>Lost cycles</dt>
@@ -243,7 +257,7 @@ function Run({ spec, loop }: { spec: Loop; loop: Followed }) {
       <label class="field">
         <span>Strategy</span>
         <select value={spec.spec.strategy} onChange={(event) => void strategy(event.currentTarget.value).catch(complain)}>
-          {STRATEGIES.map((name) => (
+          {[...new Set([...STRATEGIES, spec.spec.strategy])].map((name) => (
             <option key={name}>{name}</option>
           ))}
         </select>

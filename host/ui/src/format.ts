@@ -55,3 +55,9 @@ export function ago(ms: number): string {
   const s = Math.max(0, (Date.now() - ms) / 1_000);
   return s < 1 ? "now" : `${span_s(s)} ago`;
 }
+
+/** A number from a field, or nothing where it is none. */
+export function number(text: string): number | null {
+  const x = Number(text.replace(",", ".").replace("−", "-"));
+  return text.trim() !== "" && Number.isFinite(x) ? x : null;
+}

@@ -8,6 +8,7 @@ import { bytes, when, zone } from "./format";
 import { loops } from "./live";
 import type { Component } from "./types";
 import { Act, complain, Danger, None, say } from "./ui";
+import { by } from "./who";
 
 const all = signal<Component[]>([]);
 const busy = signal("");
@@ -182,9 +183,9 @@ function One({ digest }: { digest: string }) {
         </label>
         <Act off={note === one.note} act={async () => {
           const before = one.note;
-          await send("PATCH", path, { note, by: "page" });
+          await send("PATCH", path, { note, by: by() });
           await again();
-          say("Note kept.", async () => { await send("PATCH", path, { note: before, by: "page" }); await again(); });
+          say("Note kept.", async () => { await send("PATCH", path, { note: before, by: by() }); await again(); });
         }}>
           Keep
         </Act>
@@ -192,9 +193,9 @@ function One({ digest }: { digest: string }) {
       <div class="row wrap">
         {Object.entries(one.labels).map(([key, text]) => (
           <Act key={key} class="small" label={`Remove label ${key}`} act={async () => {
-            await send("PATCH", path, { labels: { [key]: null }, by: "page" });
+            await send("PATCH", path, { labels: { [key]: null }, by: by() });
             await again();
-            say(`Label ${key} removed.`, async () => { await send("PATCH", path, { labels: { [key]: text }, by: "page" }); await again(); });
+            say(`Label ${key} removed.`, async () => { await send("PATCH", path, { labels: { [key]: text }, by: by() }); await again(); });
           }}>
             {key}={text} ✕
           </Act>
@@ -204,7 +205,7 @@ function One({ digest }: { digest: string }) {
         <input aria-label="New label, key=value" placeholder="key=value" value={label} onInput={(event) => set_label(event.currentTarget.value)} />
         <Act off={!/^[^=]+=.+$/.test(label)} act={async () => {
           const [key, ...rest] = label.split("=");
-          await send("PATCH", path, { labels: { [key as string]: rest.join("=") }, by: "page" });
+          await send("PATCH", path, { labels: { [key as string]: rest.join("=") }, by: by() });
           set_label("");
           await again();
         }}>

@@ -7,7 +7,7 @@
 
 import { batch, computed, signal, type Signal } from "@preact/signals";
 import { get, list, words } from "./api";
-import type { Host, Loop, Notice, Point, Row, Rows, Standing, Trend } from "./types";
+import type { AlarmChange, FieldNews, Host, Loop, Notice, Point, Row, Rows, Standing, Trend } from "./types";
 
 /** Longest silence of a connection that is alive: hosts are told every second. */
 const SILENCE_MS = 3_500;
@@ -25,8 +25,13 @@ export const link = signal<Link>("connecting");
 export const lost_at = signal<number | null>(null);
 export const hosts = signal<Host[]>([]);
 export const notices = signal<Notice[]>([]);
-export const standing_alarms = signal<Notice[]>([]);
 export const points = signal<Map<string, Point>>(new Map());
+/** Points that a person holds at a value. */
+export const forced = computed(() => [...points.value.values()].filter((point) => point.force));
+/** What the feed last told of alarms. */
+export const alarm_news = signal<AlarmChange[]>([]);
+/** Grows when a job moved. */
+export const job_news = signal(0);
 export const trouble = signal("");
 /** Records that this page was too slow for, since it was loaded. */
 export const lost_rows = signal(0);
@@ -147,6 +152,8 @@ function connect(resume: boolean): void {
   on<Notice[]>("notices", take_notices);
   on<{ hosts: Host[] }>("hosts", (data) => (hosts.value = data.hosts));
   on<Standing[]>("loops", take_standing);
+  on<{ lost: number; news: FieldNews[] }>("field", take_field);
+  on<AlarmChange[]>("alarms", (changes) => (alarm_news.value = changes));
   feed.onerror = () => {
     if (source === feed) is_lost();
   };
@@ -206,17 +213,6 @@ function take_notices(fresh: Notice[]): void {
   // A host that was started again counts anew.
   const kept = notices.peek().filter((notice) => notice.number < from || notice.at_unix_us < (fresh[0]?.at_unix_us ?? 0));
   notices.value = [...kept, ...fresh].slice(-NOTICES_MAX);
-  const alarms = new Map(standing_alarms.peek().map((notice) => [alarm_key(notice), notice]));
-  for (const notice of fresh) {
-    if (notice.kind === "alarm") alarms.set(alarm_key(notice), notice);
-    else if (notice.kind === "alarm-cleared") alarms.delete(alarm_key(notice));
-  }
-  standing_alarms.value = [...alarms.values()];
-}
-
-/** `alarm NAME: …` and `alarm NAME is over` are of one alarm. */
-function alarm_key(notice: Notice): string {
-  return `${notice.loop} ${/^alarm (\S+?):? /.exec(`${notice.text} `)?.[1] ?? notice.text}`;
 }
 
 let loading_specs = false;
@@ -276,17 +272,43 @@ export async function load_points(): Promise<void> {
   }
 }
 
+/** What happened to points by hand, and to jobs. */
+function take_field(data: { lost: number; news: FieldNews[] }): void {
+  const changed = new Map(points.peek());
+  let [of_points, of_jobs] = [false, data.lost > 0];
+  for (const { forced, unforced, job } of data.news) {
+    const name = forced?.point ?? unforced?.point ?? "";
+    const point = changed.get(name);
+    if (point) {
+      changed.set(name, { ...point, force: forced?.force ?? null });
+      of_points = true;
+    }
+    of_jobs ||= job !== undefined;
+  }
+  if (of_points) points.value = changed;
+  if (of_jobs) job_news.value += 1;
+  if (data.lost > 0) void load_points();
+}
+
+/** Points of a loop that a person holds, by port. */
+export function forced_ports(loop: Loop | null): { port: string; point: Point }[] {
+  if (!loop || forced.value.length === 0) return [];
+  return Object.entries(loop.spec.ports).flatMap(([port, name]) => {
+    const point = points.value.get(name);
+    return point?.force ? [{ port, point }] : [];
+  });
+}
+
 /** What the feed does not bring by itself. */
 async function load(): Promise<void> {
   try {
     const [told, is_demo, document] = await Promise.all([
-      get<{ notices: Notice[]; standing: Notice[] }>("/v1/notices?limit=1000"),
+      get<{ notices: Notice[] }>("/v1/notices?limit=1000"),
       get<{ demo: boolean }>("/v1/demo"),
       get<{ paths: Record<string, unknown> }>("/openapi.json"),
     ]);
     batch(() => {
       notices.value = told.notices;
-      standing_alarms.value = told.standing;
       demo.value = is_demo.demo;
       addresses.value = new Set(Object.keys(document.paths));
     });

@@ -3,17 +3,25 @@
 import { effect, signal } from "@preact/signals";
 import { render } from "preact";
 import { useEffect, useRef } from "preact/hooks";
-import { Events, Hosts, note_steps, Points } from "./cell";
+import { follow_alarms, unseen } from "./alarms";
+import { Bell } from "./alarm_parts";
+import { Alarms, FloodBanner } from "./alarms_view";
+import { Audit } from "./audit";
+import { Events, Hosts, note_steps } from "./cell";
 import { Change, take_file } from "./change";
 import { Face, NewLoop } from "./face";
+import { Lab } from "./lab";
+import { NameField } from "./name";
+import { Points } from "./points";
 import { clock, zone } from "./format";
-import { here, hosts, link, loops, lost_at, notices, standing_alarms, start, tick, trouble } from "./live";
+import { addresses, forced, here, hosts, link, loops, lost_at, notices, start, tick, trouble } from "./live";
 import { Library, take_into_library } from "./library";
 import { Overview, abnormal } from "./overview";
 import { Rollouts } from "./rollouts";
 import "./style.css";
 import { set_theme, show, theme } from "./theme";
 import { complain, Dialog, Messages, undo_last } from "./ui";
+import { who } from "./who";
 
 const place = signal<string[]>([]);
 
@@ -30,14 +38,21 @@ read_place();
 
 const VIEWS: [string, string][] = [
   ["", "Loops"],
-  ["library", "Library"],
+  ["alarms", "Alarms"],
   ["hosts", "Hosts"],
   ["points", "Points"],
   ["events", "Events"],
+  ["library", "Library"],
   ["rollouts", "Rollouts"],
+  ["lab", "Lab"],
+  ["audit", "Audit"],
 ];
+/** What a host must have so that a view is offered. */
+const NEEDS: Record<string, string> = { alarms: "/v1/alarms", lab: "/v1/lab/reports", audit: "/v1/audit" };
+const offered = (view: string): boolean => !NEEDS[view] || addresses.value.size === 0 || addresses.value.has(NEEDS[view]);
 
 const help = signal(false);
+const naming = signal(false);
 const dragging = signal(false);
 
 function View() {
@@ -53,10 +68,16 @@ function View() {
       return <NewLoop />;
     case "library":
       return <Library digest={name} />;
+    case "alarms":
+      return <Alarms tab={name} />;
+    case "lab":
+      return <Lab name={name} />;
+    case "audit":
+      return <Audit />;
     case "hosts":
       return <Hosts />;
     case "points":
-      return <Points />;
+      return <Points tab={name} />;
     case "events":
       return <Events />;
     case "rollouts":
@@ -97,9 +118,10 @@ function Connection() {
 function Urgent() {
   const last = notices.value.findLast((notice) => notice.weight === "urgent");
   const fresh = last && Date.now() - last.at_unix_us / 1_000 < 10_000;
+  const alarm = unseen.value.find((one) => one.priority === "high" && one.came_unix_ms !== null && Date.now() - one.came_unix_ms < 10_000);
   return (
     <div class="hidden" role="log" aria-live="assertive" aria-label="Urgent events">
-      {fresh ? `${last.loop}: ${last.text}` : ""}
+      {alarm ? `Alarm ${alarm.name} of ${alarm.loop}, high priority` : fresh ? `${last.loop}: ${last.text}` : ""}
     </div>
   );
 }
@@ -109,11 +131,20 @@ function Frame() {
   const what = place.value[0] ?? "";
   const odd = [...loops.value.values()].filter((loop) => abnormal(loop).length > 0).length;
   const dead = hosts.value.filter((host) => !host.alive).length;
-  const marks: Record<string, number> = { "": odd, hosts: dead, events: standing_alarms.value.length };
+  const marks: Record<string, [number, string]> = {
+    "": [odd, "abnormal"],
+    hosts: [dead, "not alive"],
+    points: [forced.value.length, "forced"],
+  };
+  const waiting = unseen.value.length;
   const main = useRef<HTMLElement>(null);
   useEffect(() => {
-    document.title = `${odd > 0 ? `(${odd}) ` : ""}${here.value ? `${here.value} – ` : ""}Bumpless`;
-  }, [odd, here.value]);
+    document.title = `${waiting > 0 ? `▲${waiting} ` : ""}${odd > 0 ? `(${odd}) ` : ""}${here.value ? `${here.value} – ` : ""}Bumpless`;
+  }, [odd, waiting, here.value]);
+  useEffect(() => {
+    // Where places do not fit side by side, the one that is looked at is in view.
+    document.querySelector(".top nav a[aria-current]")?.scrollIntoView({ block: "nearest", inline: "nearest" });
+  }, [what]);
   return (
     <>
       <a class="skip" href="#main" onClick={(event) => { event.preventDefault(); main.current?.focus(); }}>
@@ -128,16 +159,22 @@ function Frame() {
           Bumpless
         </a>
         <nav aria-label="Places">
-          {VIEWS.map(([id, name]) => {
+          {VIEWS.filter(([id]) => offered(id)).map(([id, name]) => {
+            const [count, kind] = marks[id] ?? [0, ""];
             const current = what === id || (id === "" && ["loop", "change", "new"].includes(what));
             return (
               <a key={id} href={`#/${id}`} aria-current={current ? "page" : undefined}>
                 {name}
-                {marks[id] ? <b class="mark" aria-label={`${marks[id]} abnormal`}>{marks[id]}</b> : null}
+                {count > 0 && (
+                  <b class="mark" aria-label={`${count} ${kind}`}>
+                    {count}
+                  </b>
+                )}
               </a>
             );
           })}
         </nav>
+        {offered("alarms") && <Bell />}
         <div class="status">
           <span class={`link ${link.value}`}>
             <i />
@@ -148,6 +185,9 @@ function Frame() {
           </time>
           <button type="button" class="plain" aria-label={`Colours: ${theme.value}. Change`} title={`Colours: ${theme.value}`} onClick={() => set_theme(theme.value === "system" ? "dark" : theme.value === "dark" ? "light" : "system")}>
             {theme.value === "dark" ? "☾" : theme.value === "light" ? "☀" : "◐"}
+          </button>
+          <button type="button" class="plain who-button" aria-label={`Your name, for the record: ${who.value || "not given"}. Change`} title="your name, for the record" onClick={() => (naming.value = true)}>
+            {who.value || "no name"}
           </button>
           <button type="button" class="plain" aria-label="Keys and help" onClick={() => (help.value = true)}>
             ?
@@ -160,17 +200,21 @@ function Frame() {
           {trouble.value}
         </div>
       )}
+      <FloodBanner />
       <main id="main" ref={main} tabIndex={-1} class={link.value === "live" ? "" : "stale"}>
         <View />
       </main>
       <Messages />
       <Urgent />
       {dragging.value && <div class="dropping">Drop the component: {what === "change" || what === "loop" ? `the way to change ${place.value[1]} begins` : "it goes to the library"}</div>}
+      {naming.value && <Naming />}
       {help.value && (
         <Dialog title="Keys" close={() => (help.value = false)}>
           <dl>
-            <dt>1 – 6</dt>
-            <dd>Loops, Library, Hosts, Points, Events, Rollouts</dd>
+            <dt>1 – 9</dt>
+            <dd>{VIEWS.map(([, name]) => name).join(", ")}</dd>
+            <dt>a</dt>
+            <dd>the alarms</dd>
             <dt>u</dt>
             <dd>take back the last setpoint, mode or tuning, while its message stands</dd>
             <dt>← → + − End</dt>
@@ -187,11 +231,31 @@ function Frame() {
   );
 }
 
+function Naming() {
+  return (
+    <Dialog title="Who are you?" close={() => (naming.value = false)}>
+      <p>A name that goes with what you do: acknowledging, forcing, changing. It proves nothing, and it is kept in this browser.</p>
+      <form
+        method="dialog"
+        class="enter"
+        onSubmit={(event) => {
+          event.preventDefault();
+          naming.value = false;
+        }}
+      >
+        <NameField />
+        <button type="submit">Done</button>
+      </form>
+    </Dialog>
+  );
+}
+
 addEventListener("keydown", (event) => {
   const target = event.target as HTMLElement;
   if (event.ctrlKey || event.metaKey || event.altKey || target.closest("input, textarea, select, dialog")) return;
   const view = VIEWS[Number(event.key) - 1];
   if (view) location.hash = `#/${view[0]}`;
+  else if (event.key === "a") location.hash = "#/alarms";
   else if (event.key === "u") undo_last();
   else if (event.key === "?") help.value = true;
 });
@@ -223,6 +287,7 @@ addEventListener("drop", (event) => {
 
 show();
 start();
+follow_alarms();
 effect(() => {
   // With each beat of the hosts.
   hosts.value;

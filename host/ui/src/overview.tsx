@@ -4,7 +4,9 @@ import { signal } from "@preact/signals";
 import { memo } from "preact/compat";
 import { useEffect, useRef } from "preact/hooks";
 import { span_s, value } from "./format";
-import { actuate, backfill, type Followed, hosts, is_old, link, loops, measure, standing_alarms, tick } from "./live";
+import { actuate, backfill, type Followed, forced_ports, hosts, is_old, link, loops, measure, tick } from "./live";
+import { is_unseen, key_of, limits_of, says, told_of } from "./alarms";
+import { Prio } from "./alarm_parts";
 import { colour, colours } from "./theme";
 import { Bar, None } from "./ui";
 
@@ -25,9 +27,14 @@ export function abnormal(loop: Followed): { text: string; grave: boolean }[] {
     else if (row.quality === "uncertain") found.push({ text: "measurement is uncertain", grave: false });
     if (row.faults_in_row > 0) found.push({ text: `${row.faults_in_row} faulty cycles in a row`, grave: true });
   }
-  for (const alarm of standing_alarms.value) {
-    if (alarm.loop === loop.name) found.push({ text: alarm.text, grave: alarm.weight === "urgent" });
+  // A fault and a bad measurement are said above, as long as they last.
+  for (const alarm of told_of(loop.name)) {
+    if (!(row && ["fault", "bad-quality", "redundancy-lost"].includes(alarm.definition.kind))) {
+      found.push({ text: says(alarm, true), grave: alarm.priority === "high" && alarm.state !== "latched" });
+    }
   }
+  const held = forced_ports(spec);
+  if (held.length > 0) found.push({ text: `${held.map(({ port }) => port).join(", ")} forced by hand`, grave: false });
   if (standing && spec && standing.members.length < Math.min(spec.spec.replicas, controllers())) {
     found.push({ text: `${standing.members.length} of ${spec.spec.replicas} replicas`, grave: standing.members.length === 0 });
   }
@@ -100,6 +107,7 @@ const Card = memo(function Card(props: { loop: Followed }) {
   const range = measure(spec);
   const found = abnormal(loop);
   const grave = found.some((one) => one.grave);
+  const own = told_of(loop.name);
   const port = row ? (Object.keys(row.outputs)[0] ?? "") : "";
   const out = actuate(spec, port);
   if (only_abnormal.value && found.length === 0) return null;
@@ -107,6 +115,10 @@ const Card = memo(function Card(props: { loop: Followed }) {
     <article class={`card${grave ? " grave" : found.length ? " odd" : ""}${is_old(loop) ? " old" : ""}`} aria-label={loop.name}>
       <header>
         <a href={`#/loop/${loop.name}`}>{loop.name}</a>
+        {own.slice(0, 3).map((alarm) => (
+          <Prio key={key_of(alarm)} priority={alarm.priority} seen={!is_unseen(alarm)} label={`${alarm.priority} alarm ${alarm.name}`} />
+        ))}
+        {forced_ports(spec).length > 0 && <span class="tag forced">FORCED</span>}
         {row?.mode === "manual" && <span class="tag manual">MAN</span>}
         {row?.probation_cycles_left ? <span class="tag">probation {row.probation_cycles_left}</span> : null}
         {standing?.pending_revision ? <span class="tag">changing</span> : null}
@@ -121,8 +133,8 @@ const Card = memo(function Card(props: { loop: Followed }) {
           OUT {value(port ? row?.outputs[port] : null, out.span)} {out.unit}
         </span>
       </div>
-      <Bar label={`measurement of ${loop.name}`} kind="pv" at={row?.measurement ?? null} mark={row?.setpoint} low={range.low} high={range.high} unit={range.unit} />
-      <Bar label={`output of ${loop.name}`} kind="out" at={port ? (row?.outputs[port] ?? null) : null} low={out.low} high={out.high} unit={out.unit} />
+      <Bar label={`measurement of ${loop.name}`} kind="pv" at={row?.measurement ?? null} mark={row?.setpoint} low={range.low} high={range.high} unit={range.unit} limits={limits_of(loop.name)} />
+      <Bar label={`output of ${loop.name}`} kind="out" at={port ? (row?.outputs[port] ?? null) : null} low={out.low} high={out.high} unit={out.unit} limits={port ? limits_of(loop.name, port) : undefined} />
       <Spark loop={loop} />
       <footer>
         <span class="trouble">{found[0]?.text ?? ""}</span>

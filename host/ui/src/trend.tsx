@@ -10,6 +10,8 @@ import "uplot/dist/uPlot.min.css";
 import { type Columns, Past } from "./columns";
 import { clock, day, decimals, duration_us, span_s, value, zone } from "./format";
 import { follow, hosts, link, loops, notices, trace, trace_grew } from "./live";
+import type { Limit } from "./alarms";
+import { draw_limits, with_limits } from "./limits";
 import { colour, colours, host_colour } from "./theme";
 
 const SPANS_S = [30, 60, 300, 900, 3_600, 14_400];
@@ -26,7 +28,9 @@ interface Axis {
   high: number;
 }
 
-export function TrendView(props: { loop: string; ports: string[]; replicas: number; period_ms: number; measure: Axis; actuate: Axis }) {
+export function TrendView(props: { loop: string; ports: string[]; replicas: number; period_ms: number; measure: Axis; actuate: Axis; limits: Limit[] }) {
+  const limits = useRef(props.limits);
+  limits.current = props.limits;
   const box = useRef<HTMLDivElement>(null);
   const lanes = useRef<HTMLCanvasElement>(null);
   const [span, set_span] = useState(300);
@@ -213,7 +217,7 @@ export function TrendView(props: { loop: string; ports: string[]; replicas: numb
       cursor: { drag: { x: false, y: false }, y: false, points: { size: 6 } },
       scales: {
         x: { time: true, auto: false },
-        y: { range: padded(measure_span * 0.04, 0.62, 0) },
+        y: { range: (u, low, high) => padded(measure_span * 0.04, 0.62, 0)(u, ...with_limits(limits.current, measure_span * 0.04, low, high)) },
         o: { range: padded(actuate_span * 0.04, 0, 1.6) },
       },
       axes: [
@@ -243,6 +247,7 @@ export function TrendView(props: { loop: string; ports: string[]; replicas: numb
         ],
         draw: [
           (u) => {
+            draw_limits(u, limits.current, measure_span);
             const context = u.ctx;
             const [min, max] = window_of();
             const dpr = devicePixelRatio;
@@ -301,6 +306,7 @@ export function TrendView(props: { loop: string; ports: string[]; replicas: numb
   useSignalEffect(() => {
     if (trace_grew.value >= 0 && (view.current.end === null || past.failure)) draw();
   });
+  useEffect(() => draw(), [JSON.stringify(props.limits)]);
   useSignalEffect(() => {
     if (link.value === "live") {
       past.forget();

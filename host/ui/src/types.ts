@@ -2,7 +2,7 @@
 // Times are µs or ms since 1970-01-01 UTC; a number that is not finite is null.
 
 export type Mode = "manual" | "automatic";
-export type Quality = "bad" | "uncertain" | "good";
+export type Quality = "bad" | "uncertain" | "good" | "forced";
 export type Weight = "info" | "warning" | "urgent";
 
 export interface Row {
@@ -58,6 +58,8 @@ export interface Host {
   io: boolean;
   control: boolean;
   draining: boolean;
+  drain_kept: boolean;
+  labels: string[];
   api: string | null;
   cpu_percent: number;
   cpu_process_cores: number;
@@ -81,6 +83,15 @@ export interface Policy {
   [key: string]: unknown;
 }
 
+/** How a vote stands. */
+export interface Vote {
+  answers: number;
+  agreed: number;
+  needed: number;
+  dissents: number;
+  aside: { host: string; clean: number }[];
+}
+
 export interface LoopDraft {
   name: string;
   component: string;
@@ -93,6 +104,9 @@ export interface LoopDraft {
   strategy: string;
   replicas: number;
   limits: Record<string, OutputLimit>;
+  fallback?: string | null;
+  fallback_parameters?: Record<string, number>;
+  prefer?: string[];
   policy: Policy;
   [key: string]: unknown;
 }
@@ -111,6 +125,7 @@ export interface Loop {
   measured_unit: string | null;
   tally: { taken: number; lost: number; skipped: number; takeovers: number; refused: number } | null;
   failures: { revision: number; reason: string; tries: number }[];
+  redundancy?: { have: number; want: number; vote: Vote | null } | null;
 }
 
 export interface Point {
@@ -126,6 +141,134 @@ export interface Point {
   age_ms: number;
   written_by: string | null;
   text: string;
+  force: Force | null;
+}
+
+/** Who holds a point at a value, and until when. */
+export interface Force {
+  value: number | null;
+  since_unix_ms: number;
+  until_unix_ms: number;
+  by: string;
+  why: string;
+}
+
+export interface Bus {
+  name: string;
+  host: string;
+  driver: string;
+  connected: boolean;
+  points: number;
+  polls: number;
+  writes: number;
+  errors: number;
+  last_error: string | null;
+  latency_us: number;
+  jobs: { name: string; text: string }[];
+  jobs_waiting: number;
+  redundant: { with: string; epoch: number | null } | null;
+}
+
+export type JobState = "queued" | "running" | "done" | "failed" | "cancelled" | "expired";
+
+export interface Block {
+  unit_id: number;
+  table: string;
+  address: number;
+  count: number;
+  values: number[];
+}
+
+export interface Job {
+  id: string;
+  host: string;
+  bus: string;
+  task: string;
+  by: string;
+  state: JobState;
+  ahead: number;
+  step: number;
+  steps: number;
+  reason: string;
+  result: Block[];
+  asked_unix_ms: number;
+  began_unix_ms: number | null;
+  ended_unix_ms: number | null;
+}
+
+/** One of these is there. */
+export interface FieldNews {
+  job?: Job;
+  forced?: { point: string; host: string; force: Force };
+  unforced?: { point: string; host: string; by: string };
+  written?: { point: string; host: string; value: number | null; by: string };
+}
+
+export type Priority = "low" | "medium" | "high";
+export type AlarmState = "normal" | "active" | "acknowledged" | "returned" | "latched";
+
+/** An alarm as it was decided upon. */
+export interface AlarmDefinition {
+  kind: string;
+  port?: string | null;
+  limit?: number | null;
+  dead_band: number;
+  on_delay_s: number;
+  off_delay_s: number;
+  priority: Priority;
+  latching: boolean;
+  group?: string | null;
+  suppressed_by?: string | null;
+  cause: string;
+  consequence: string;
+  response: string;
+}
+
+export interface Alarm {
+  loop: string;
+  name: string;
+  host: string;
+  state: AlarmState;
+  priority: Priority;
+  age_s: number | null;
+  value: number | null;
+  text: string;
+  comings: number;
+  first_out: boolean;
+  acknowledged_by: string | null;
+  note: string | null;
+  quiet: boolean;
+  shelf: { seconds_left: number; by: string; reason: string } | null;
+  suppressed: boolean;
+  out_of_service: string | null;
+  definition: AlarmDefinition;
+}
+
+export interface Flood {
+  host: string;
+  comings: number;
+  is_flood: boolean;
+}
+
+export interface AlarmList {
+  alarms: Alarm[];
+  floods: Flood[];
+  silent: { host: string; reason: string }[];
+  next?: string | null;
+}
+
+export interface AlarmChange {
+  at_unix_us: number;
+  loop: string;
+  alarm: string;
+  what: string;
+  state: AlarmState;
+  priority: Priority;
+  value: number | null;
+  by: string | null;
+  note: string;
+  quiet: boolean;
+  first_out: boolean;
 }
 
 export interface Parameter {
@@ -270,4 +413,36 @@ export interface Rollout {
   total: number;
   done: number;
   loops: { loop: string; stage: string; reason: string; cycles_before: number; cycles: number; error_before: number | null; error: number | null }[];
+}
+
+/** An entry of the audit trail with its place in its host's chain. */
+export interface AuditLine {
+  host: string;
+  number: number;
+  prev: string;
+  hash: string;
+  at: string;
+  what: string;
+  by: string;
+  via: string;
+  from: string;
+  loop: string | null;
+  target: string;
+  asked: unknown;
+  changes: { field: string; before: unknown; after: unknown }[];
+  outcome: string;
+  reason: string;
+  took_ms: number;
+}
+
+export interface AuditList {
+  entries: AuditLine[];
+  next: string | null;
+  silent?: { host: string; reason: string }[];
+}
+
+export interface AuditProof {
+  good: boolean;
+  chains: { host: string; good: boolean; first: number; last: number; flaw: { segment: string; line: number; reason: string } | null }[];
+  silent: { host: string; reason: string }[];
 }

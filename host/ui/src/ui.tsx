@@ -6,6 +6,7 @@ import { useEffect, useId, useRef, useState } from "preact/hooks";
 import { words } from "./api";
 import { value } from "./format";
 import { link } from "./live";
+import type { Limit } from "./alarms";
 
 /** A message at the lower edge. */
 interface Message {
@@ -17,8 +18,9 @@ interface Message {
 export const messages = signal<Message[]>([]);
 let next_message = 1;
 
-/** How long a message stays, in ms; bad ones stay until they are closed. */
+/** How long a message stays, in ms, and one that offers to take something back; bad ones stay until they are closed. */
 const MESSAGE_MS = 10_000;
+const UNDO_MS = 30_000;
 
 export function say(text: string, undo?: () => Promise<unknown>): void {
   put({ id: next_message++, text, bad: false, undo });
@@ -30,7 +32,7 @@ export function complain(error: unknown): void {
 
 function put(message: Message): void {
   messages.value = [...messages.value.slice(-3), message];
-  if (!message.bad) setTimeout(() => drop(message.id), MESSAGE_MS);
+  if (!message.bad) setTimeout(() => drop(message.id), message.undo ? UNDO_MS : MESSAGE_MS);
 }
 
 function drop(id: number): void {
@@ -111,16 +113,21 @@ export function Act(props: {
 }
 
 /** A dialog of the browser's own: it keeps the focus and closes with Escape. */
-export function Dialog(props: { title: string; close: () => void; children: ComponentChildren }) {
+export function Dialog(props: { title: string; close: () => void; children: ComponentChildren; wide?: boolean }) {
   const dialog = useRef<HTMLDialogElement>(null);
+  const gone = useRef(false);
   const id = useId();
   useEffect(() => {
     const element = dialog.current;
     if (element && !element.open) element.showModal();
-    return () => element?.close();
+    return () => {
+      // Its close event comes later; what took its place must not hear it.
+      gone.current = true;
+      element?.close();
+    };
   }, []);
   return (
-    <dialog ref={dialog} aria-labelledby={id} onClose={props.close}>
+    <dialog ref={dialog} class={props.wide ? "wide" : undefined} aria-labelledby={id} onClose={() => { if (!gone.current) props.close(); }}>
       <header>
         <h2 id={id}>{props.title}</h2>
         <button type="button" class="plain" aria-label="Close" onClick={props.close}>
@@ -173,7 +180,7 @@ export function Danger(props: { label: string; title: string; text: string; name
 }
 
 /** A value in its range, with a mark for what is wanted. Said in words to those who do not see it. */
-export function Bar(props: { label: string; at: number | null; mark?: number | null; low: number; high: number; unit: string; kind: "pv" | "out" }) {
+export function Bar(props: { label: string; at: number | null; mark?: number | null; low: number; high: number; unit: string; kind: "pv" | "out"; limits?: Limit[] }) {
   const part = (x: number | null | undefined): number =>
     x === null || x === undefined || !(props.high > props.low) ? 0 : Math.min(1, Math.max(0, (x - props.low) / (props.high - props.low)));
   const span = props.high - props.low;
@@ -188,6 +195,9 @@ export function Bar(props: { label: string; at: number | null; mark?: number | n
       aria-valuetext={`${value(props.at, span)} ${props.unit}`}
     >
       <i style={{ width: `${(100 * part(props.at)).toFixed(1)}%` }} />
+      {props.limits
+        ?.filter((limit) => limit.at >= props.low && limit.at <= props.high)
+        .map((limit) => <u key={limit.name} class={limit.on ? `on ${limit.priority}` : ""} title={`${limit.name}: ${limit.kind} ${value(limit.at, span)} ${props.unit}`} style={{ left: `${(100 * part(limit.at)).toFixed(1)}%` }} />)}
       {props.mark !== null && props.mark !== undefined && <b style={{ left: `${(100 * part(props.mark)).toFixed(1)}%` }} />}
     </div>
   );

@@ -15,6 +15,8 @@ export default async function start(): Promise<() => Promise<void>> {
   const components = process.env.BUMPLESS_COMPONENTS ?? join(root, "target/components");
   process.env.BUMPLESS_COMPONENTS = components;
   const folder = mkdtempSync(join(tmpdir(), "bumpless-page-"));
+  process.env.BUMPLESS_BIN = program;
+  process.env.BUMPLESS_PAGE_FOLDER = folder;
   const child = spawn(program, ["demo", "--for", "1500", "--tanks", "5", "--dir", folder, "--components", components], {
     stdio: ["ignore", "pipe", "pipe"],
   });

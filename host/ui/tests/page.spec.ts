@@ -1,55 +1,7 @@
 // What an operator and an engineer do with the page, in a real browser, on a real cell.
 import { readFileSync } from "node:fs";
-import { createRequire } from "node:module";
-import { join } from "node:path";
-import { expect, type Page, test } from "@playwright/test";
-
-const base = (): string => process.env.BUMPLESS_PAGE ?? "";
-const component = (name: string): string => join(process.env.BUMPLESS_COMPONENTS ?? "", `${name}.wasm`);
-const axe_source = readFileSync(createRequire(import.meta.url).resolve("axe-core/axe.min.js"), "utf8");
-
-/** Opens a place and waits until numbers come. */
-async function open(page: Page, place: string): Promise<void> {
-  await page.goto(`${base()}/#/${place}`);
-  await expect(page.locator(".link.live")).toBeVisible();
-}
-
-/** Asks the API beside the page. */
-async function ask<T>(path: string, method = "GET", body?: unknown): Promise<T> {
-  const response = await fetch(`${base()}${path}`, {
-    method,
-    headers: body === undefined ? {} : { "content-type": "application/json" },
-    body: body === undefined ? undefined : JSON.stringify(body),
-  });
-  expect(response.ok, `${method} ${path}: ${response.status} ${await response.clone().text()}`).toBe(true);
-  const type = response.headers.get("content-type") ?? "";
-  return (type.includes("json") ? await response.json() : undefined) as T;
-}
-
-interface Loop {
-  setpoint: number;
-  mode: string;
-  owner: string;
-  component: string;
-  seq: number;
-  revision: number;
-  outputs: Record<string, number>;
-  tally: { lost: number; taken: number };
-}
-const loop = (name: string): Promise<Loop> => ask<Loop>(`/v1/loops/${name}`);
-
-/** Nothing serious for those who use the page with other senses. */
-async function serious(page: Page, what: string): Promise<string[]> {
-  await page.evaluate(axe_source);
-  const found = await page.evaluate(async () => {
-    const axe = (window as unknown as { axe: { run: (context: Document, options: object) => Promise<{ violations: { id: string; impact: string; nodes: { target: string[]; failureSummary: string }[] }[] }> } }).axe;
-    const result = await axe.run(document, { resultTypes: ["violations"] });
-    return result.violations
-      .filter((violation) => violation.impact === "serious" || violation.impact === "critical")
-      .map((violation) => `${violation.id}: ${violation.nodes.map((node) => `${node.target.join(" ")} ${node.failureSummary}`).slice(0, 3).join("; ")}`);
-  });
-  return found.map((one) => `${what}: ${one}`);
-}
+import { expect, test } from "@playwright/test";
+import { ask, component, figure, loop, open, serious } from "./steps";
 
 /** Nothing on the page may go wrong unseen. */
 test.beforeEach(({ page }) => {
@@ -280,7 +232,7 @@ for (const scheme of ["light", "dark"] as const) {
     test.slow();
     await page.emulateMedia({ colorScheme: scheme });
     const found: string[] = [];
-    for (const place of ["", "loop/pressure", "change/pressure", "library", "hosts", "points", "events", "rollouts", "new"]) {
+    for (const place of ["", "loop/pressure", "change/pressure", "library", "hosts", "points", "events", "rollouts", "lab", "new"]) {
       await open(page, place);
       await expect(page.getByRole("heading", { level: 1 })).toBeVisible();
       found.push(...(await serious(page, place || "overview")));
@@ -292,12 +244,6 @@ for (const scheme of ["light", "dark"] as const) {
     const wider = await page.evaluate(() => document.documentElement.scrollWidth - innerWidth);
     expect(wider, "nothing sticks out on a phone").toBeLessThanOrEqual(0);
   });
-}
-
-/** A picture for the documentation; only where the caller wants them. */
-async function figure(page: Page, name: string): Promise<void> {
-  const folder = process.env.BUMPLESS_FIGURES;
-  if (folder) await page.screenshot({ path: join(folder, `page-${name}.png`), animations: "disabled" });
 }
 
 test("pictures for the documentation", async ({ page }) => {
@@ -317,6 +263,26 @@ test("pictures for the documentation", async ({ page }) => {
   await open(page, "loop/pressure");
   await expect(page.locator(".plot canvas")).toBeVisible();
   await figure(page, "phone-dark");
+});
+
+test("a way to the plant is made slow and lossy for a while", async ({ page }) => {
+  interface Last {
+    owner: string;
+    seq: number;
+    last: { committed_after_us: number };
+  }
+  const last = (): Promise<Last> => ask<Last>("/v1/loops/pressure");
+  if ((await loop("pressure")).owner !== "b") await ask("/v1/loops/pressure/move", "POST", { host: "b" });
+  await open(page, "hosts");
+  await expect(page.getByRole("button", { name: "Delay 10 s, plant" })).toHaveCount(0);
+  await page.getByRole("button", { name: "Delay 10 s, b" }).click();
+  await expect(page.getByText("delay b: asked for")).toBeVisible();
+  // 30 ms to the owner and 30 ms back; or another one took over meanwhile.
+  await expect.poll(async () => { const now = await last(); return now.owner !== "b" || now.last.committed_after_us >= 60_000; }, { intervals: [50] }).toBe(true);
+  await page.getByRole("button", { name: "Lose 10 s, c" }).click();
+  await expect(page.getByText("lose c: asked for")).toBeVisible();
+  const { seq } = await last();
+  await expect.poll(async () => (await last()).seq).toBeGreaterThan(seq + 20);
 });
 
 // The last one: it kills.

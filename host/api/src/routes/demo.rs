@@ -25,6 +25,10 @@ pub enum FaultKind {
     Pause,
     /// All cores of the machine kept busy.
     Stress,
+    /// What passes between it and the plant comes 30 ms later, each way.
+    Delay,
+    /// A tenth of what passes between it and the plant is lost and sent again.
+    Lose,
     /// Started again, where it is dead.
     Start,
 }
@@ -37,7 +41,7 @@ pub struct Fault {
     pub fault: FaultKind,
     /// The host; of no meaning for `stress`, which all hosts of the machine feel.
     pub host: String,
-    /// For so long, in s, 1 to 60: `pause` and `stress`; 3 where not given.
+    /// For so long, in s, 1 to 60: `pause`, `stress`, `delay` and `lose`; 3 where not given.
     #[serde(default = "three")]
     pub seconds: u32,
 }

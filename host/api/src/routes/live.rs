@@ -80,11 +80,12 @@ pub(crate) enum Form {
 /// records this reader was too slow for).
 ///
 /// With `form=rows`, for pages that watch many loops: `rows` (LiveRows) every `every_ms` (50 to 10,000, else 200), `notices` (what
-/// people should hear of), `hosts` every second, `loops` (where each loop stands) when that changed. Every event has an id; with
+/// people should hear of), `hosts` every second, `loops` (where each loop stands) when that changed, `field` (LiveField) when a point was
+/// forced, freed or written by hand, or a job moved. Every event has an id; with
 /// `Last-Event-ID` a reader gets the notices and the traced cycles that it missed. A slow reader gets the newest of each loop.
 #[utoipa::path(get, operation_id = "follow_records", path = "/v1/live", tag = "cell", params(LiveQuery),
     responses(
-        (status = 200, description = "Server-sent events: `record` with a Record, `hosts` with Hosts, `field` with FieldNews, `lost` with {\"records\": n}; in rows: `rows`, `notices`, `hosts`, `loops`",
+        (status = 200, description = "Server-sent events: `record` with a Record, `hosts` with Hosts, `field` with FieldNews, `lost` with {\"records\": n}; in rows: `rows`, `notices`, `hosts`, `loops`, `field` with LiveField",
             body = Record, content_type = "text/event-stream"),
         (status = "default", description = "What went wrong", body = Problem, content_type = "application/problem+json")))]
 pub(crate) async fn feed(

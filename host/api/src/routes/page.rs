@@ -33,7 +33,7 @@ const FILES: &[Embedded] = include!(concat!(env!("OUT_DIR"), "/page.rs"));
 
 /// What a page of this host may do: load from this host, and nothing else.
 const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; font-src 'self'; \
-                      connect-src 'self'; manifest-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
+                      connect-src 'self'; frame-src 'self'; manifest-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
 
 /// The short page.
 const ADDRESSES: &str = include_str!("index.html");

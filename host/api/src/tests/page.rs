@@ -4,6 +4,8 @@ use axum::{
     body::BodyDataStream,
     http::{StatusCode, header},
 };
+use bumpless_core::PointId;
+use bumpless_deploy::commissioning::FieldEvent;
 use futures_util::StreamExt as _;
 use serde_json::{Value, json};
 use tokio::sync::mpsc;
@@ -110,6 +112,21 @@ async fn a_feed_in_rows_begins_with_all_loops_and_tells_the_newest_of_each() {
         "each cycle of the traced loop, and of no other"
     );
     assert_eq!(rows["lost"], 0);
+
+    // What happens to points and jobs comes in one event per beat.
+    for value in [1.0, 2.0] {
+        let written = FieldEvent::Written {
+            point: PointId::new("line.out").expect("a name"),
+            host: fake::host(),
+            value,
+            by: "ann".into(),
+        };
+        bench.cell.news.send(written).expect("somebody listens");
+    }
+    let (_, field) = named(&mut events, "field").await;
+    assert_eq!(field["lost"], 0);
+    let written = |n: usize| field["news"][n]["written"]["value"].clone();
+    assert_eq!((written(0), written(1)), (json!(1.0), json!(2.0)), "{field}");
 
     // A reader that slept: what fell out of the channel is counted, and the newest of each loop is there all the same.
     for seq in 0..fake::FEED_CAPACITY as u64 + 3 {

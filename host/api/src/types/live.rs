@@ -6,7 +6,7 @@ use bumpless_core as model;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-use super::{Mode, PortTable, Quality, finite, us};
+use super::{FieldNews, Mode, PortTable, Quality, finite, us};
 
 /// The numbers of one cycle, without what only the full record has.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
@@ -80,6 +80,15 @@ pub struct LiveRows {
     pub loops: Vec<LiveRow>,
     /// Every cycle of the loops whose trace was asked for, oldest first. Those made up for after a pause come here too.
     pub trace: Vec<LiveRow>,
+}
+
+/// What happened to points and jobs since the last beat, in the feed in rows.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct LiveField {
+    /// Happenings that are left out because too many came at once: ask for points and jobs again.
+    pub lost: u64,
+    /// What happened, oldest first.
+    pub news: Vec<FieldNews>,
 }
 
 /// Where a loop stands beside its cycles. Sent when something of any loop changes; a loop that is gone is not in it.

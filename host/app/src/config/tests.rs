@@ -28,6 +28,7 @@ fn the_least_file_is_a_control_host_on_loopback() {
     );
     assert!(matches!(config.engine.compile, bumpless_engine::Compile::Child { .. }));
     assert_eq!(config.history_bytes_max, Some(512 * 1024 * 1024));
+    assert_eq!(config.lab_reports, None);
 }
 
 #[test]
@@ -59,6 +60,8 @@ fn a_full_file_is_taken_as_it_stands() {
         workers = 3
         [history]
         enabled = false
+        [lab]
+        reports = "lab-out"
     "#;
     let config = parse(text).expect("a good file");
     assert_eq!((config.io, config.control), (true, true));
@@ -72,6 +75,7 @@ fn a_full_file_is_taken_as_it_stands() {
         panic!("a simulated bus")
     };
     assert_eq!(sim.journal.as_deref(), Some(Path::new("/etc/bumpless/writes.csv")));
+    assert_eq!(config.lab_reports.as_deref(), Some(Path::new("/etc/bumpless/lab-out")));
 }
 
 #[test]

@@ -8,9 +8,10 @@
 //! Never: restarts a child by itself.
 
 use std::{
+    collections::BTreeMap,
     fs::{self, File},
     io::{BufRead as _, BufReader},
-    net::{Ipv4Addr, TcpListener},
+    net::{Ipv4Addr, SocketAddr, TcpListener},
     os::unix::process::{CommandExt as _, ExitStatusExt as _},
     path::{Path, PathBuf},
     process::{self, ExitStatus, Stdio},
@@ -24,6 +25,7 @@ use std::{
 use bumpless_api::types::Fault;
 use rustix::process::{Pid, Signal, kill_process};
 
+use super::relay::Relay;
 use crate::{error::Error, host::Ready, show};
 
 /// Longest wait for a host to get ready.
@@ -152,7 +154,7 @@ fn host_file(name: &str, port: u16, connect: &[String], tanks: Option<u32>) -> S
     let mut text = format!(
         "# A host of the demonstration; the next start replaces this file.\nhost = \"{name}\"\n\n\
          [cell]\nname = \"demo\"\nlisten = [\"tcp/127.0.0.1:0\"]\nconnect = [{}]\n\n\
-         [api]\nlisten = \"127.0.0.1:{port}\"\n",
+         [api]\nlisten = \"127.0.0.1:{port}\"\n\n[lab]\nreports = \"../reports\"\n",
         connect.join(", ")
     );
     if tanks.is_some() {
@@ -231,19 +233,25 @@ impl Child {
 pub(super) struct Cell {
     plan: Plan,
     children: Vec<Child>,
+    /// The way from each controller to the plant, by the controller's name.
+    relays: BTreeMap<String, Relay>,
 }
 
 impl Cell {
-    /// Starts the first host, then the others side by side, and waits until all are ready.
+    /// Starts the first host, then the others side by side, each behind a relay to the first, and waits until all are ready.
     pub(super) fn start(plan: Plan, stop: &AtomicBool) -> Result<Self, Error> {
         let first = plan.spawn(0, &[])?.wait(stop)?;
-        let at = first.ready.cell.clone();
+        let at = address(&first.ready)?;
         let mut cell = Self {
             plan,
             children: vec![first],
+            relays: BTreeMap::new(),
         };
+        for (name, _) in cell.plan.hosts.iter().skip(1) {
+            cell.relays.insert(name.clone(), Relay::start(at)?);
+        }
         let starting: Vec<Result<Starting, Error>> = (1..cell.plan.hosts.len())
-            .map(|index| cell.plan.spawn(index, &at))
+            .map(|index| cell.plan.spawn(index, &cell.known_to(index)))
             .collect();
         for started in starting {
             cell.children.push(started?.wait(stop)?);
@@ -259,6 +267,21 @@ impl Cell {
     /// Address of a host's API.
     pub(super) fn api(&self, name: &str) -> Option<&str> {
         self.children.iter().find(|child| child.name == name).map(Child::api)
+    }
+
+    /// The way of a controller to the plant.
+    pub(super) fn relay(&self, name: &str) -> Option<&Relay> {
+        self.relays.get(name)
+    }
+
+    /// Where a host finds others when it starts: a controller knows the plant, by its relay, and learns of the rest from there.
+    /// The plant knows nobody, for they come to it; else it would go to them past the relays.
+    fn known_to(&self, index: usize) -> Vec<String> {
+        let name = self.plan.hosts.get(index).map(|(name, _)| name);
+        name.and_then(|name| self.relays.get(name))
+            .map(Relay::locator)
+            .into_iter()
+            .collect()
     }
 
     /// Sends a signal to a host that lives; false where there is none of that name.
@@ -294,17 +317,16 @@ impl Cell {
             if !child.dead || only.is_some_and(|name| name != child.name) {
                 continue;
             }
-            let others = self
-                .children
-                .iter()
-                .enumerate()
-                .filter(|(other, child)| *other != index && !child.dead);
-            let connect: Vec<String> = others.flat_map(|(_, child)| child.ready.cell.clone()).collect();
             let back = self
                 .plan
-                .spawn(index, &connect)
-                .and_then(|starting| starting.wait(stop));
-            ends.push(back.map(|child| {
+                .spawn(index, &self.known_to(index))
+                .and_then(|starting| starting.wait(stop))
+                .and_then(|child| Ok((address(&child.ready)?, child)));
+            ends.push(back.map(|(at, child)| {
+                if index == 0 {
+                    // The plant is elsewhere now; the controllers come to it again by themselves.
+                    self.relays.values().for_each(|relay| relay.lead_to(at));
+                }
                 let name = child.name.clone();
                 self.children[index] = child;
                 name
@@ -343,6 +365,18 @@ impl Drop for Cell {
     fn drop(&mut self) {
         self.stop();
     }
+}
+
+/// Where a host listens for others.
+fn address(ready: &Ready) -> Result<SocketAddr, Error> {
+    let locator = ready.cell.first().map(String::as_str).unwrap_or_default();
+    let text = locator.strip_prefix("tcp/").unwrap_or(locator);
+    text.parse().map_err(|_| {
+        Error::Demo(format!(
+            "host {} listens at {locator:?}, which is no address",
+            ready.host
+        ))
+    })
 }
 
 /// Closes a process's standard input, waits, and kills it where that did not help.
@@ -398,6 +432,7 @@ mod tests {
         assert_eq!((a.io, a.control), (false, true));
         assert_eq!(a.cell.connect, at);
         assert_eq!(a.api_listen.port(), 8481);
+        assert_eq!(a.lab_reports.as_deref(), Some(Path::new("../reports")));
     }
 
     #[test]

@@ -3,6 +3,7 @@
 //! ```text
 //! kill ─► dead until somebody starts it      pause ─► stopped ─ its time is over ─► continued
 //! start ─► started again                     stress ─► every core busy ─ its time is over ─► over
+//! delay, lose ─► its way to the plant is bad ─ its time is over ─► good
 //! ```
 //! Never: lasts longer than a minute, or longer than the demonstration; never touches a process that is not its child.
 
@@ -23,12 +24,18 @@ use crate::error::Error;
 
 /// Threads that keep cores busy at most.
 const BURNERS_MAX: usize = 64;
+/// What `delay` adds each way. Two of them are more than what a 10 Hz cycle waits before it asks another replica.
+const DELAY: Duration = Duration::from_millis(30);
+/// Pieces of a hundred that `lose` loses.
+const LOST_PERCENT: u32 = 10;
 
 /// Faults that last.
 #[derive(Default)]
 pub(super) struct Faults {
     /// Hosts that are paused, and until when.
     paused: Vec<(String, Instant)>,
+    /// Hosts whose way to the plant is bad, and until when.
+    bad_ways: Vec<(String, Instant)>,
     /// Until when the cores are busy.
     stressed: Option<Instant>,
 }
@@ -59,23 +66,49 @@ impl Faults {
                 burn(time)?;
                 Ok(format!("every core is busy for {} s, as asked for", time.as_secs()))
             }
+            FaultKind::Delay | FaultKind::Lose => {
+                let relay = cell
+                    .relay(host)
+                    .ok_or_else(|| Error::Demo(format!("{host} has no way to the plant that could be bad")))?;
+                let what = if fault.fault == FaultKind::Delay {
+                    relay.delay(DELAY);
+                    format!("is {} ms longer each way", DELAY.as_millis())
+                } else {
+                    relay.lose(LOST_PERCENT);
+                    format!("loses {LOST_PERCENT} % of what passes")
+                };
+                self.bad_ways.retain(|(name, _)| name != host);
+                self.bad_ways.push((host.clone(), Instant::now() + time));
+                Ok(format!(
+                    "the way from {host} to the plant {what} for {} s, as asked for",
+                    time.as_secs()
+                ))
+            }
             FaultKind::Start => Ok(format!("host {host} is started again, as asked for")),
         }
     }
 
-    /// Continues whoever was paused for long enough; says who.
+    /// Ends what has lasted for long enough; says what.
     pub(super) fn look(&mut self, cell: &Cell) -> Vec<String> {
-        let now = Instant::now();
-        let (over, paused) = std::mem::take(&mut self.paused)
+        let paused = over(&mut self.paused)
             .into_iter()
-            .partition(|(_, until)| *until <= now);
-        self.paused = paused;
-        let over: Vec<(String, Instant)> = over;
-        over.into_iter()
-            .filter(|(name, _)| cell.signal(name, Signal::CONT))
-            .map(|(name, _)| format!("host {name} goes on"))
-            .collect()
+            .filter(|name| cell.signal(name, Signal::CONT))
+            .map(|name| format!("host {name} goes on"));
+        let bad_ways = over(&mut self.bad_ways).into_iter().filter_map(|name| {
+            let relay = cell.relay(&name)?;
+            relay.delay(Duration::ZERO);
+            relay.lose(0);
+            Some(format!("the way from {name} to the plant is good again"))
+        });
+        paused.chain(bad_ways).collect()
     }
+}
+
+/// Takes out whose time is over.
+fn over(lasting: &mut Vec<(String, Instant)>) -> Vec<String> {
+    let now = Instant::now();
+    let ended = lasting.extract_if(.., |(_, until)| *until <= now);
+    ended.map(|(name, _)| name).collect()
 }
 
 /// One thread per core that computes until its time is over.

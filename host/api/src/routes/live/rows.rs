@@ -4,7 +4,7 @@
 //! Last-Event-ID or after= ─► making up: notices and traced cycles since then
 //!      └ none ─► the newest of every loop
 //! beat (every_ms) ─► all records that passed meanwhile ─► newest of each loop, every one of the traced ─► one event `rows`
-//!                 └► notices since the last one ─► `notices`; each second `hosts`; when it changed `loops`
+//!                 └► notices since the last one ─► `notices`; each second `hosts`; when it changed `loops`; points and jobs: `field`
 //! ```
 //! A reader that is slow is not polled, so nothing piles up for it but the bounded channel of records; what it lost is made good
 //! by the newest record of each loop, and counted. Never: touches a cycle, or wakes for each record.
@@ -17,7 +17,7 @@ use std::{
 
 use axum::response::sse::Event;
 use bumpless_core::{LoopId, Record};
-use bumpless_deploy::Window;
+use bumpless_deploy::{Window, commissioning::FieldEvent};
 use tokio::{
     sync::{
         OwnedSemaphorePermit,
@@ -28,9 +28,9 @@ use tokio::{
 };
 
 use crate::{
-    limits::{CATCH_UP_TIME_MAX, HOSTS_EVERY, NOTICES_AT_ONCE, STANDING_EVERY, TRACE_ROWS_MAX},
+    limits::{CATCH_UP_TIME_MAX, FIELD_NEWS_AT_ONCE, HOSTS_EVERY, NOTICES_AT_ONCE, STANDING_EVERY, TRACE_ROWS_MAX},
     server::App,
-    types::{Hosts, LiveRow, LiveRows, Standing},
+    types::{Hosts, LiveField, LiveRow, LiveRows, Standing},
 };
 
 /// Where a reader stopped: the process that it read from, the last notice, the newest cycle, as `boot-number-time`.
@@ -62,6 +62,7 @@ impl Mark {
 pub(super) struct Rows {
     app: App,
     records: broadcast::Receiver<Arc<Record>>,
+    news: broadcast::Receiver<FieldEvent>,
     stop: watch::Receiver<bool>,
     beat: Interval,
     loops: Option<HashSet<LoopId>>,
@@ -96,6 +97,7 @@ impl Rows {
         let mut reader = Self {
             // From here on nothing is missed; what is made up for comes before.
             records: app.cell.records(),
+            news: app.cell.field_events(),
             stop: app.stop.clone(),
             beat,
             loops: wanted.loops,
@@ -256,6 +258,7 @@ impl Rows {
                 self.push("notices", Event::default().json_data(wanted));
             }
         }
+        self.say_field();
         if self.hosts_at.is_none_or(|at| at.elapsed() >= HOSTS_EVERY) {
             self.hosts_at = Some(Instant::now());
             let standing = standing(&self.app);
@@ -268,6 +271,22 @@ impl Rows {
                 next: None,
             };
             self.push("hosts", Event::default().json_data(hosts));
+        }
+    }
+
+    /// What happened to points and jobs. Those of a pause are not made up for: whoever comes back reads them again.
+    fn say_field(&mut self) {
+        let (mut news, mut lost) = (Vec::new(), 0);
+        loop {
+            match self.news.try_recv() {
+                Ok(event) if news.len() < FIELD_NEWS_AT_ONCE => news.push(event.into()),
+                Ok(_) => lost += 1,
+                Err(TryRecvError::Lagged(missed)) => lost += missed,
+                Err(TryRecvError::Empty | TryRecvError::Closed) => break,
+            }
+        }
+        if lost > 0 || !news.is_empty() {
+            self.push("field", Event::default().json_data(LiveField { lost, news }));
         }
     }
 
