@@ -15,6 +15,8 @@
 //! | rollouts | one component for many loops, one loop first |
 //! | calls | the cell as a control service |
 //! | refusals | bad components, loops, requests, configurations, command lines |
+//! | audit | every change leaves its entry; kill -9, tampering |
+//! | webhooks | alarms told to a receiver that is slow, away, back; and to readers at any host |
 //! | votes | a host whose steps come out wrong, and who notices |
 //! | modbus | a real Modbus device that dies and comes back |
 //! | scada | the cell as a Modbus device: points of another host, commands to a loop |
@@ -36,6 +38,7 @@
 
 mod alarms;
 mod api;
+mod audit;
 mod calls;
 mod changes;
 mod chaos;
@@ -59,6 +62,7 @@ mod stock;
 mod story;
 mod votes;
 mod watching;
+mod webhooks;
 
 use std::time::Duration;
 

@@ -17,11 +17,13 @@
 pub mod limits;
 pub mod types;
 
+mod asker;
 mod cell;
 mod error;
 mod extract;
 mod field;
 mod gate;
+mod happenings;
 mod metrics;
 mod notices;
 mod once;
@@ -34,6 +36,7 @@ mod paging;
 mod routes;
 mod server;
 mod tag;
+mod trail;
 
 #[cfg(test)]
 mod tests;

@@ -6,6 +6,7 @@
 //! Never: decides or checks more than its own shape; the cell does.
 
 mod alarms;
+mod audit;
 mod call;
 mod component;
 mod field;
@@ -13,6 +14,7 @@ mod history;
 mod hosts;
 mod library;
 mod live;
+mod load;
 mod loops;
 mod record;
 mod rollouts;
@@ -23,6 +25,7 @@ pub use alarms::{
     AlarmActRequest, AlarmActWord, AlarmDefinition, AlarmFlood, AlarmHappening, AlarmHistory, AlarmKind, AlarmShelf,
     AlarmState, LoopAlarm, LoopAlarms,
 };
+pub use audit::{AuditChain, AuditChange, AuditEntries, AuditEntry, AuditFlaw, AuditVerdicts};
 pub use call::{CallAnswer, CallRequest};
 pub use component::{Component, Components, Parameter, Port};
 pub use field::{
@@ -36,6 +39,7 @@ pub use history::{
 pub use hosts::{Alive, Drain, DrainRequest, Health, HealthCheck, Host, Hosts, Point, Points};
 pub use library::{Admission, AdmissionFinding, ComponentEvent, ComponentHost, Import, Imports, RelabelRequest};
 pub use live::{LiveRow, LiveRows, Notice, Notices, Standing, Trend, Weight};
+pub use load::{AlarmMetrics, FrequentAlarm, Webhook, Webhooks};
 pub use loops::{
     Apply, Command, Failure, HandOver, Loop, LoopDraft, Loops, ModeRequest, MoveRequest, OutputLimit, OutputRequest,
     Policy, RollbackRequest, SetRequest, SetpointRequest, SwapRequest, Tally,
@@ -45,6 +49,7 @@ pub use rollouts::{OnFailure, Rollout, RolloutLoop, RolloutRequest, RolloutStage
 pub use words::{Direction, LogLevel, Mode, OnBump, OnFault, OnFewer, PortKind, Priority, Quality, Strategy};
 
 pub(crate) use history::window;
+pub(crate) use load::silent;
 pub(crate) use loops::Depth;
 pub(crate) use record::{PortTable, PortTables};
 

@@ -18,13 +18,14 @@
 //! `book`, `library`, `roster`, `feed` (what it keeps); `admission`, `bench`, `holder`, `home`, `preference`, `drain`, `expect`,
 //! `change`, `orders`, `health` (what it does);
 //! `trials` with `rehearsal`, `verdict`, `replay`, `shadows`, `curve`, `report` (looking back, and trying candidates);
-//! `rollout` (one component for many loops, by rule);
+//! `rollout` (one component for many loops, by rule); `audit` (who changed what); `webhook`, `self_watch`;
 //! `sync`, `answers`, `service`, `room`, `deploy` (how it hangs together).
 
 mod admission;
 pub mod alarms;
 mod answers;
 mod aside;
+pub mod audit;
 mod bench;
 mod book;
 mod bundle;
@@ -49,12 +50,14 @@ mod rehearsal;
 mod replay;
 mod room;
 mod roster;
+mod self_watch;
 mod service;
 mod shadows;
 mod sync;
 mod trials;
 mod uploads;
 mod verdict;
+pub mod webhook;
 mod wire;
 
 pub mod commissioning;
@@ -75,6 +78,7 @@ pub use expect::Expect;
 pub use field::{CallSink, CommandSink, Field, WithdrawSink};
 pub use health::{Check, HealthView};
 pub use room::{DeployArrival, Parts};
+pub use self_watch::HostAlarms;
 pub use view::{
     ApplyEnd, Call, CallEnd, CommandEnd, ComponentView, Counters, DrainEnd, DrainOrder, FailureView, HandOverView,
     HostView, Imported, LoopView, PointView, Relabel, Stage, StageView, Upload,

@@ -221,6 +221,7 @@ mod tests {
             loops_held: 0,
             draining,
             drain_kept: false,
+            unix_ms: 0,
             labels: vec![],
             version: String::new(),
         }

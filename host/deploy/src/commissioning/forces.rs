@@ -15,9 +15,11 @@ use bumpless_io::{Force, IoServer, PointIndex};
 use bumpless_store::Store;
 use parking_lot::Mutex;
 use serde::{Deserialize, Serialize};
+use serde_json::json;
 
 use super::FieldEvent;
 use crate::{
+    audit::{Act, AuditKind, Seen},
     book::on_disk,
     error::{Error, chain},
     limits::{FORCES_LOOK, WORDS_CHARS_MAX},
@@ -210,7 +212,7 @@ impl Room {
 
     /// Ends a force; `only` where it is still this one.
     async fn end_force(
-        &self,
+        self: &Arc<Self>,
         io: &Arc<IoServer>,
         index: PointIndex,
         point: &PointId,
@@ -227,8 +229,14 @@ impl Room {
         let (store, key) = (self.store.clone(), point.clone());
         on_disk(move || store.remove_force(&key)).await??;
         io.unforce(index);
-        self.commissioning.forces.held.lock().remove(point);
+        let ended = self.commissioning.forces.held.lock().remove(point);
         tracing::warn!(%point, by, "forced no more");
+        if only.is_some() {
+            // Nobody asked for it, so nobody else writes it down.
+            let seen = Seen::of(json!({ "force": ended }), json!({ "force": null }));
+            let act = Act::new(AuditKind::PointUnforce, point.as_str(), json!({ "because": by }));
+            self.audit_own(act, seen, None).await;
+        }
         self.tell_field(FieldEvent::Unforced {
             point: point.clone(),
             host: self.here.clone(),
