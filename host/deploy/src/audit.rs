@@ -32,12 +32,14 @@ use crate::{
 mod asker;
 mod entry;
 mod look;
+mod sights;
 
 pub use asker::{Asker, Via};
 pub(crate) use entry::{Act, Seen};
 pub use entry::{AuditEntry, AuditKind, AuditLine, FieldChange};
 pub(crate) use look::{AuditAsk, Looked};
 pub use look::{AuditFilter, AuditFlaw, AuditList, AuditPage, AuditVerdict};
+pub(crate) use sights::component;
 
 /// Entries that are written at once.
 const AT_ONCE: usize = 64;

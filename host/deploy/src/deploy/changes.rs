@@ -4,13 +4,13 @@
 
 use std::{collections::HashSet, time::Duration};
 
-use bumpless_core::{Command, CommandBody, CommandId, ComponentInfo, Digest, HostId, Intent, LoopId, LoopSpec, Mode};
+use bumpless_core::{Command, CommandBody, CommandId, ComponentInfo, Digest, HostId, LoopId};
 use futures_util::future::join_all;
 use serde_json::{Value, json};
 
 use super::{Deploy, unexpected};
 use crate::{
-    audit::{Act, AuditKind, Seen, shown},
+    audit::{Act, AuditKind, Seen, component, shown},
     draft::{Change, LoopDraft},
     error::Error,
     expect::Expect,
@@ -18,58 +18,9 @@ use crate::{
     limits::{ANSWER_MARGIN, ANSWER_WAIT, APPLY_WAIT, DRAIN_ORDER_WAIT},
     orders::command_wait,
     plan,
-    room::Room,
     view::{ApplyEnd, CommandEnd, DrainEnd, DrainOrder, Imported, Relabel, Upload},
     wire::{Amend, Ask, Told},
 };
-
-/// A component as entries have it.
-fn component(info: &ComponentInfo) -> Value {
-    json!({ "component": title(info), "digest": info.digest.to_string(), "labels": info.labels, "note": info.note })
-}
-
-impl Room {
-    /// A specification as entries have it.
-    fn shown_spec(&self, spec: &LoopSpec) -> Value {
-        let mut value = shown(spec);
-        if let (Some(members), Some(info)) = (value.as_object_mut(), self.library.get(&spec.digest)) {
-            members.insert("component".to_owned(), json!(title(&info)));
-        }
-        value
-    }
-
-    /// The revision that a change brought, beside the one that it replaced.
-    pub(crate) async fn revised(self: &std::sync::Arc<Self>, end: &Result<ApplyEnd, Error>) -> Seen {
-        let Ok(end) = end else { return Seen::default() };
-        if end.unchanged {
-            return Seen::default();
-        }
-        let Some(held) = self.book.get(&end.id) else {
-            return Seen::default();
-        };
-        // The copy here may not have heard of it yet.
-        let told = if held.find(end.revision).is_some() && held.pending.is_none() {
-            None
-        } else {
-            match self.ask(&held.home, Ask::Intent(end.id.clone()), ANSWER_WAIT).await {
-                Ok(Told::Intent(told)) => told,
-                _ => None,
-            }
-        };
-        self.seen_revision(told.as_deref().unwrap_or(&held), end.revision)
-    }
-
-    /// A revision beside the one before it.
-    pub(crate) fn seen_revision(&self, intent: &Intent, revision: u64) -> Seen {
-        // In force, then those that were left, the one left last first.
-        let mut left = std::iter::once(&intent.current)
-            .chain(&intent.past)
-            .skip_while(|spec| spec.revision != revision);
-        let after = left.next().map(|spec| self.shown_spec(spec)).unwrap_or_default();
-        let before = left.next().map(|spec| self.shown_spec(spec)).unwrap_or_default();
-        Seen::of(before, after)
-    }
-}
 
 /// A draft's loop, where its name can be one.
 fn of_draft(draft: &LoopDraft) -> Act {
@@ -542,59 +493,4 @@ impl Deploy {
 /// A name that somebody gave; what stands in for none is none.
 fn named(by: &str) -> &str {
     if by == "api" { "" } else { by }
-}
-
-impl Room {
-    /// Values by output port; by number where the library does not know the component.
-    fn outputs(&self, id: &LoopId, values: &[f64]) -> Value {
-        let info = self
-            .book
-            .get(id)
-            .and_then(|intent| self.library.get(&intent.current.digest));
-        let name = |number: usize| {
-            let port = info.as_ref().and_then(|info| info.descriptor.outputs().nth(number));
-            port.map_or_else(|| number.to_string(), |(_, port)| port.name.clone())
-        };
-        let named = values
-            .iter()
-            .enumerate()
-            .map(|(number, value)| (name(number), json!(value)));
-        Value::Object(named.collect())
-    }
-
-    fn asked_of(&self, id: &LoopId, body: &CommandBody) -> Value {
-        match body {
-            CommandBody::Setpoint(setpoint) => json!({ "setpoint": setpoint }),
-            CommandBody::Mode(mode) => json!({ "mode": mode_name(*mode) }),
-            CommandBody::Output(values) => json!({ "outputs": self.outputs(id, values) }),
-            CommandBody::Revise(revision) => json!({ "revision": revision }),
-        }
-    }
-
-    /// What a command is about, as the last record has it.
-    fn stood(&self, id: &LoopId, body: &CommandBody) -> Value {
-        let Some(last) = self.feed.last(id) else {
-            return Value::Null;
-        };
-        match body {
-            CommandBody::Setpoint(_) => json!({ "setpoint": last.record.setpoint }),
-            CommandBody::Mode(_) => json!({ "mode": mode_name(last.record.mode) }),
-            CommandBody::Output(_) => json!({ "outputs": self.outputs(id, &last.record.outputs) }),
-            CommandBody::Revise(_) => Value::Null,
-        }
-    }
-
-    /// And as the record with its outcome has it.
-    fn stands(&self, id: &LoopId, body: &CommandBody, end: &CommandEnd) -> Value {
-        match body {
-            CommandBody::Setpoint(_) => json!({ "setpoint": end.setpoint }),
-            CommandBody::Mode(_) => json!({ "mode": mode_name(end.mode) }),
-            CommandBody::Output(values) => json!({ "outputs": self.outputs(id, values) }),
-            CommandBody::Revise(_) => Value::Null,
-        }
-    }
-}
-
-const fn mode_name(mode: Mode) -> &'static str {
-    mode.name()
 }
