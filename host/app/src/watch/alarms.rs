@@ -60,7 +60,7 @@ pub(crate) fn alarms(client: &Client, json: bool, loop_name: Option<&str>, count
                 show::line(&if json { text } else { row(&event) })?;
             }
             Some(News::Disconnected(reason)) => {
-                show::note(&format!("the feed ended ({reason}); another host is tried"))
+                show::note(&format!("the feed ended ({reason}); another host is tried"));
             }
             Some(News::Gone(reason)) => {
                 return Err(Error::Unreachable {
