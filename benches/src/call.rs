@@ -206,6 +206,7 @@ fn vitals(host: HostId, ready: Digest) -> Vitals {
         loops_held: 0,
         draining: false,
         drain_kept: false,
+        unix_ms: 0,
         labels: vec![],
         version: String::new(),
     }

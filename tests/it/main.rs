@@ -18,6 +18,8 @@
 //! | calls | the cell as a control service |
 //! | recovery | a measurement that comes back, under each policy on bad input |
 //! | refusals | bad components, loops, requests, configurations, command lines |
+//! | audit | every change leaves its entry; kill -9, tampering |
+//! | webhooks | alarms told to a receiver that is slow, away, back; and to readers at any host |
 //! | votes | a host whose steps come out wrong, and who notices |
 //! | modbus | a real Modbus device that dies and comes back |
 //! | scada | the cell as a Modbus device: points of another host, commands to a loop |
@@ -39,6 +41,7 @@
 
 mod alarms;
 mod api;
+mod audit;
 mod calls;
 mod changes;
 mod chaos;
@@ -65,6 +68,7 @@ mod stock;
 mod story;
 mod votes;
 mod watching;
+mod webhooks;
 
 use std::time::Duration;
 

@@ -17,12 +17,14 @@
 pub mod limits;
 pub mod types;
 
+mod asker;
 mod cell;
 mod door;
 mod error;
 mod extract;
 mod field;
 mod gate;
+mod happenings;
 mod metrics;
 mod notices;
 mod once;
@@ -35,6 +37,7 @@ mod paging;
 mod routes;
 mod server;
 mod tag;
+mod trail;
 
 #[cfg(test)]
 mod tests;

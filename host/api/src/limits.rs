@@ -88,8 +88,20 @@ pub const PORT_TABLES_MAX: usize = 1_024;
 /// Characters of a header that is for people (`x-note`, `x-by`).
 pub const NOTE_CHARS_MAX: usize = 512;
 
+/// Characters of the name that a request gives (`x-by`).
+pub const BY_CHARS_MAX: usize = 200;
+
+/// Entries of the audit trail in one answer, where the asker names no number.
+pub const AUDIT_DEFAULT: u32 = 100;
+
+/// Entries of the audit trail in one answer at most: some 500 KB.
+pub const AUDIT_MAX: u32 = bumpless_deploy::limits::AUDIT_LIST_MAX;
+
 /// Notices that a host remembers: some 500 KiB, and hours of an ordinary day.
 pub const NOTICES_MAX: usize = 2_000;
+
+/// Happenings of alarms that a host remembers for readers that come back: some 700 KiB, and a flood.
+pub const HAPPENINGS_MAX: usize = 2_000;
 
 /// Notices of one event of a feed, and of one answer where nothing is said.
 pub const NOTICES_AT_ONCE: usize = 200;

@@ -25,7 +25,7 @@ use axum::{
     response::{IntoResponse as _, Response},
 };
 use bumpless_core::limits::COMPONENT_BYTES_MAX;
-use bumpless_deploy::limits::BUNDLE_BYTES_MAX;
+use bumpless_deploy::{audit::Asker, limits::BUNDLE_BYTES_MAX};
 use futures_util::{Stream, StreamExt as _};
 use sha2::{Digest as _, Sha256};
 use tokio::time::Instant;
@@ -296,7 +296,7 @@ async fn first(held: Held, request: Request, next: Next) -> Response {
         });
         Some(Response::from_parts(parts, Body::from(body)))
     };
-    match tokio::spawn(work.in_current_span()).await {
+    match tokio::spawn(Asker::current().asks(work).in_current_span()).await {
         Ok(Some(response)) => response,
         Ok(None) | Err(_) => Problem::new(
             Kind::Internal,

@@ -9,7 +9,8 @@ use utoipa::OpenApi;
 use crate::{
     error::Problem,
     routes::{
-        alarms, bundle, components, demo, field, health, history, hosts, lab, live, loops, pages, rollouts, trend,
+        alarms, audit, bundle, components, demo, field, health, history, hosts, lab, live, load, loops, pages, rollouts,
+        trend,
     },
     types,
 };
@@ -30,6 +31,7 @@ use crate::{
         history::start_shadow, history::shadows, history::show_shadow, history::stop_shadow,
         rollouts::start, rollouts::list, rollouts::show, rollouts::stop,
         alarms::list, alarms::past, alarms::show, alarms::act, alarms::define, alarms::remove,
+        load::metrics, load::webhooks, audit::list, audit::verify, audit::export,
         hosts::list, health::of_host, hosts::drain, hosts::undrain, hosts::points, live::feed, trend::trend, trend::list_notices, demo::show, demo::fault, lab::list, lab::show,
         field::point, field::write, field::force, field::unforce, field::buses,
         field::start, field::jobs, field::job, field::cancel,
@@ -43,6 +45,7 @@ use crate::{
         (name = "history", description = "Looking back: recorded cycles, replays, and candidates tried on them or beside a running loop"),
         (name = "rollouts", description = "One component for many loops: one loop first, then the rest by rule"),
         (name = "alarms", description = "What stands, what happened, and what people do about it, by ANSI/ISA-18.2"),
+        (name = "audit", description = "Who changed what: a chain of entries on each host, listed, verified, exported"),
         (name = "cell", description = "Hosts, points and the live feed"),
         (name = "field", description = "Points by hand, forces, buses, and jobs: what takes long is acknowledged at once and told of later"),
         (name = "lab", description = "Reports of experiments, where the host has a folder of them"),

@@ -3,6 +3,7 @@
 //! Never: decides; what may be done is the cell's to say.
 
 pub(crate) mod alarms;
+pub(crate) mod audit;
 pub(crate) mod bundle;
 pub(crate) mod components;
 pub(crate) mod demo;
@@ -12,6 +13,7 @@ pub(crate) mod history;
 pub(crate) mod hosts;
 pub(crate) mod lab;
 pub(crate) mod live;
+pub(crate) mod load;
 pub(crate) mod loops;
 pub(crate) mod page;
 pub(crate) mod pages;
@@ -73,6 +75,11 @@ pub(crate) fn all() -> Router<App> {
                 .put(alarms::define)
                 .delete(alarms::remove),
         )
+        .route("/v1/alarms/metrics", get(load::metrics))
+        .route("/v1/webhooks", get(load::webhooks))
+        .route("/v1/audit", get(audit::list))
+        .route("/v1/audit/verify", get(audit::verify))
+        .route("/v1/audit/export", get(audit::export))
         .route("/v1/hosts", get(hosts::list))
         .route("/v1/hosts/{name}/health", get(health::of_host))
         .route("/v1/hosts/{name}/drain", post(hosts::drain))

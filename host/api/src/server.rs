@@ -21,7 +21,7 @@ use axum::{
     response::{IntoResponse as _, Response},
 };
 use bumpless_core::Digest;
-use bumpless_deploy::{Deploy, SPANS};
+use bumpless_deploy::{Deploy, SPANS, audit::Asker};
 use futures_util::FutureExt as _;
 use tokio::{
     net::TcpListener,
@@ -30,10 +30,12 @@ use tokio::{
 use tracing::Instrument as _;
 
 use crate::{
+    asker::{self, Peer},
     cell::{Answer, Cell},
     door,
     error::{Error, Kind, Problem},
     gate::Gate,
+    happenings::Happenings,
     limits::{
         BUNDLE_TIME_MAX, CALL_TIME_MAX, CHANGE_TIME_MAX, FEEDS_MAX, PORT_TABLES_MAX, REQUEST_TIME_MAX, REQUESTS_MAX,
         STOP_TIME_MAX, UPLOAD_TIME_MAX, UPLOADS_MAX,
@@ -89,6 +91,8 @@ pub(crate) struct App {
     pub(crate) stop: watch::Receiver<bool>,
     /// What people should hear of.
     pub(crate) notices: Arc<Notices>,
+    /// What happened to alarms.
+    pub(crate) happenings: Arc<Happenings>,
     /// Where all loops stand, as JSON, and since when that is known.
     pub(crate) standing: Arc<Mutex<Option<Standing>>>,
     /// What was asked for and done, by key.
@@ -115,6 +119,7 @@ impl App {
             requests: Arc::new(Semaphore::new(options.requests_max)),
             ports: Arc::default(),
             notices: Arc::new(Notices::new()),
+            happenings: Arc::default(),
             standing: Arc::default(),
             keys: Arc::default(),
             conditional: Arc::default(),
@@ -146,7 +151,7 @@ impl App {
 
 /// Finishes what was begun, even when its asker leaves: a change stops only at an end that the cell knows.
 pub(crate) async fn finish<T: Send + 'static>(answer: Answer<T>) -> Result<T, Problem> {
-    match tokio::spawn(answer.in_current_span()).await {
+    match tokio::spawn(Asker::current().asks(answer).in_current_span()).await {
         Ok(result) => result.map_err(Into::into),
         Err(error) => {
             tracing::error!(%error, "a change ended with a panic");
@@ -183,13 +188,15 @@ pub(crate) async fn serve_cell(
     let app = App::new(Arc::clone(&cell), options, stop.clone());
     let follower = tokio::spawn(Arc::clone(&app.metrics).follow(cell, stop.clone()));
     let listener_of_notices = tokio::spawn(Notices::follow(app.clone()));
+    let listener_of_alarms = tokio::spawn(Happenings::follow(app.clone()));
     let graceful = async move {
         shutdown.await;
         // Nobody listens only when nothing is served any more.
         let _ = stopping.send(true);
     };
     let serving = async {
-        axum::serve(Gate::new(listener), router(app))
+        let service = router(app).into_make_service_with_connect_info::<Peer>();
+        axum::serve(Gate::new(listener), service)
             .with_graceful_shutdown(graceful)
             .await
     };
@@ -206,6 +213,7 @@ pub(crate) async fn serve_cell(
     };
     follower.abort();
     listener_of_notices.abort();
+    listener_of_alarms.abort();
     end
 }
 
@@ -232,6 +240,7 @@ pub(crate) fn router(app: App) -> Router {
     // Health is asked for most when the host has no place left.
     limited
         .merge(routes::health())
+        .layer(middleware::from_fn(asker::named))
         .layer(middleware::from_fn_with_state(app.clone(), finish_answer))
         .with_state(app)
 }

@@ -3,7 +3,8 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "tests")]
 
-mod alarms;
+pub(crate) mod alarms;
+pub(crate) mod audit;
 mod candidates;
 pub(crate) mod fake;
 mod field;
@@ -39,6 +40,7 @@ use crate::{
 /// A cell, its API, and the switch that stops it.
 struct Bench {
     cell: Arc<Fake>,
+    app: App,
     router: Router,
     stop: watch::Sender<bool>,
 }
@@ -51,8 +53,14 @@ impl Bench {
     fn with(options: &Options) -> Self {
         let cell = Arc::new(Fake::new());
         let (stop, stopped) = watch::channel(false);
-        let router = router(App::new(Arc::clone(&cell) as _, options, stopped));
-        Self { cell, router, stop }
+        let app = App::new(Arc::clone(&cell) as _, options, stopped);
+        let router = router(app.clone());
+        Self {
+            cell,
+            app,
+            router,
+            stop,
+        }
     }
 
     async fn ask(&self, request: Request<Body>) -> axum::response::Response {

@@ -6,6 +6,7 @@
 //! Never: decides or checks more than its own shape; the cell does.
 
 mod alarms;
+mod audit;
 mod call;
 mod component;
 mod field;
@@ -14,6 +15,7 @@ mod hosts;
 mod lab;
 mod library;
 mod live;
+mod load;
 mod loops;
 mod news;
 mod record;
@@ -25,6 +27,7 @@ pub use alarms::{
     AlarmActRequest, AlarmActWord, AlarmDefinition, AlarmFlood, AlarmHappening, AlarmHistory, AlarmKind, AlarmShelf,
     AlarmState, LoopAlarm, LoopAlarms,
 };
+pub use audit::{AuditChain, AuditChange, AuditEntries, AuditEntry, AuditFlaw, AuditVerdicts};
 pub use call::{CallAnswer, CallRequest};
 pub use component::{Component, Components, Parameter, Port};
 pub use field::{
@@ -39,6 +42,7 @@ pub use hosts::{Alive, Drain, DrainRequest, Health, HealthCheck, Host, Hosts, Po
 pub use lab::{LabReport, LabReports};
 pub use library::{Admission, AdmissionFinding, ComponentEvent, ComponentHost, Import, Imports, RelabelRequest};
 pub use live::{LiveField, LiveRow, LiveRows, Notice, Notices, Standing, Trend, Weight};
+pub use load::{AlarmMetrics, FrequentAlarm, Webhook, Webhooks};
 pub use loops::{
     Apply, Command, Failure, HandOver, Loop, LoopDraft, Loops, ModeRequest, MoveRequest, OutputLimit, OutputRequest,
     Policy, RollbackRequest, SetRequest, SetpointRequest, SwapRequest, Tally,
@@ -49,6 +53,7 @@ pub use rollouts::{OnFailure, Rollout, RolloutLoop, RolloutRequest, RolloutStage
 pub use words::{Direction, LogLevel, Mode, OnBump, OnFault, OnFewer, PortKind, Priority, Quality, Strategy};
 
 pub(crate) use history::window;
+pub(crate) use load::silent;
 pub(crate) use loops::Depth;
 pub(crate) use record::{PortTable, PortTables};
 

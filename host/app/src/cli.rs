@@ -8,6 +8,7 @@ use clap::{CommandFactory as _, Parser, Subcommand, ValueEnum};
 use clap_complete::Shell;
 
 mod alarm;
+mod audit;
 mod cell;
 mod history;
 pub(crate) mod io;
@@ -16,6 +17,7 @@ mod library;
 mod rollout;
 
 pub(crate) use alarm::{AlarmCommand, Of as AlarmOf};
+pub(crate) use audit::{AuditCommand, Format as AuditFormat, ListArgs as AuditListArgs, Noted};
 pub(crate) use cell::HostsCommand;
 pub(crate) use history::HistoryCommand;
 pub(crate) use lab::{LabArgs, LabCommand, LabRunArgs};
@@ -84,6 +86,11 @@ pub(crate) enum Command {
     Alarm {
         #[command(subcommand)]
         what: Option<AlarmCommand>,
+    },
+    /// The audit trail, who changed what: list, verify, export.
+    Audit {
+        #[command(subcommand)]
+        what: Option<AuditCommand>,
     },
     /// Control experiments in virtual time: run, compare, sweep, report; from a recorded loop, and to a live one.
     Lab(LabArgs),
@@ -348,6 +355,11 @@ pub fn run(cli: Cli) -> Result<(), Error> {
         Command::Loop { what } => commands::loops::run(&client()?, json, what),
         Command::Rollout { what } => commands::rollouts::run(&client()?, json, what),
         Command::Alarm { what } => commands::alarms::run(&client()?, json, what.unwrap_or(AlarmCommand::standing())),
+        Command::Audit { what } => commands::audit::run(
+            client,
+            json,
+            what.unwrap_or_else(|| AuditCommand::List(AuditListArgs::default())),
+        ),
         Command::Lab(LabArgs { what }) => commands::lab::run(client, json, what),
         Command::Io { what } => commands::io::run(client, json, what),
         Command::Call(args) => commands::components::call(&client()?, json, args),
@@ -416,6 +428,12 @@ mod tests {
             "bumpless alarm out pressure high --reason repair",
             "bumpless alarm define alarms.toml",
             "bumpless alarm remove pressure high",
+            "bumpless alarm watch --loop pressure --count 3",
+            "bumpless audit",
+            "bumpless audit list --from -1h --loop pressure --by ann --what loop --limit 5 --after plant:7",
+            "bumpless audit verify",
+            "bumpless audit verify audit.jsonl --holds plant:7:0123456789abcdef0123456789abcdef0123456789abcdef0123456789abcdef",
+            "bumpless audit export --format csv --host plant --to 2026-03-01T06:00:00Z -o audit.csv",
             "bumpless loop backtest pressure pidplus -p k=2 -p action=direct --last 5000 --plot x.svg",
             "bumpless loop shadow pressure pidplus --cycles 200 --wait",
             "bumpless loop shadows pressure 3 --stop",
@@ -474,6 +492,8 @@ mod tests {
                 "bumpless alarm shelve pressure high --for soon --reason x",
                 "write it as 30s, 10m or 2h",
             ),
+            ("bumpless audit verify x --holds plant:7", "HOST:NUMBER:HASH"),
+            ("bumpless audit export --format xml", "[possible values: jsonl, csv]"),
             ("bumpless io force oven.pv 80 --why test", "--for"),
             ("bumpless io force oven.pv 80 --for 25h --why test", "1s to 24h"),
             ("bumpless io scan", "<ADDRESS>"),

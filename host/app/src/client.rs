@@ -31,6 +31,8 @@ const ANSWER_BYTES_MAX: u64 = 64 * 1024 * 1024;
 pub(crate) struct Client {
     agent: Agent,
     base: String,
+    /// Who asks, for the audit trail.
+    by: String,
 }
 
 /// The text of a good answer.
@@ -70,7 +72,12 @@ impl Client {
         Ok(Self {
             agent: config.into(),
             base,
+            by: who(),
         })
+    }
+
+    fn url(&self, path: &str) -> String {
+        format!("{}{path}", self.base)
     }
 
     /// The address.
@@ -128,7 +135,7 @@ impl Client {
 
     /// `GET` with a time limit on the body.
     pub(crate) fn get(&self, path: &str) -> Result<Answer, Error> {
-        let request = self.agent.get(format!("{}{path}", self.base));
+        let request = self.agent.get(self.url(path)).header("x-by", &self.by);
         self.answer(request.config().timeout_recv_body(Some(BODY_TIME_MAX)).build().call())
     }
 
@@ -159,7 +166,7 @@ impl Client {
 
     /// `GET` of raw bytes, at most `bytes_max`.
     pub(crate) fn bytes(&self, path: &str, bytes_max: u64) -> Result<Vec<u8>, Error> {
-        let request = self.agent.get(format!("{}{path}", self.base));
+        let request = self.agent.get(self.url(path)).header("x-by", &self.by);
         let request = request
             .config()
             .timeout_recv_response(Some(WORK_TIME_MAX))
@@ -175,29 +182,34 @@ impl Client {
 
     /// `GET` of a body without an end, to be read piece by piece. A silence longer than `silence_max` ends it.
     pub(crate) fn stream(&self, path: &str, silence_max: Duration) -> Result<impl Read + Send + use<>, Error> {
-        let request = self.agent.get(format!("{}{path}", self.base));
+        let request = self.agent.get(self.url(path)).header("x-by", &self.by);
         let response = self.good(request.config().timeout_per_read(Some(silence_max)).build().call())?;
         Ok(response.into_body().into_with_config().limit(u64::MAX).reader())
     }
 
     /// `POST` of JSON.
     pub(crate) fn post(&self, path: &str, body: &impl Serialize) -> Result<Answer, Error> {
-        self.answer(self.agent.post(format!("{}{path}", self.base)).send_json(body))
+        self.answer(self.agent.post(self.url(path)).header("x-by", &self.by).send_json(body))
     }
 
     /// `PUT` of JSON.
     pub(crate) fn put(&self, path: &str, body: &impl Serialize) -> Result<Answer, Error> {
-        self.answer(self.agent.put(format!("{}{path}", self.base)).send_json(body))
+        self.answer(self.agent.put(self.url(path)).header("x-by", &self.by).send_json(body))
     }
 
     /// `DELETE`.
     pub(crate) fn delete(&self, path: &str) -> Result<Answer, Error> {
-        self.answer(self.agent.delete(format!("{}{path}", self.base)).call())
+        self.answer(self.agent.delete(self.url(path)).header("x-by", &self.by).call())
     }
 
     /// `PATCH` of JSON.
     pub(crate) fn patch(&self, path: &str, body: &impl Serialize) -> Result<Answer, Error> {
-        self.answer(self.agent.patch(format!("{}{path}", self.base)).send_json(body))
+        self.answer(
+            self.agent
+                .patch(self.url(path))
+                .header("x-by", &self.by)
+                .send_json(body),
+        )
     }
 
     /// `POST` of `length` bytes of a type, which the cell may work on for long.
@@ -210,7 +222,8 @@ impl Client {
     ) -> Result<Answer, Error> {
         let request = self
             .agent
-            .post(format!("{}{path}", self.base))
+            .post(self.url(path))
+            .header("x-by", &self.by)
             .config()
             .timeout_recv_response(Some(WORK_TIME_MAX))
             .build()
@@ -218,6 +231,17 @@ impl Client {
             .header("content-length", length.to_string());
         self.answer(request.send(SendBody::from_reader(bytes)))
     }
+}
+
+/// The name that goes with each request: `BUMPLESS_BY`, else the user's. What is no letter of ASCII is left out, for it would be
+/// read in different ways.
+fn who() -> String {
+    let name = std::env::var("BUMPLESS_BY").or_else(|_| std::env::var("USER"));
+    let name = name.unwrap_or_default();
+    name.chars()
+        .filter(|c| c.is_ascii_graphic() || *c == ' ')
+        .take(200)
+        .collect()
 }
 
 /// One segment of a path or one value of a query, percent-encoded (RFC 3986): unreserved characters and `@` stay.

@@ -3,6 +3,7 @@
 //! Never: decide; what the cell refuses is an error with the cell's own words.
 
 pub(crate) mod alarms;
+pub(crate) mod audit;
 pub(crate) mod components;
 pub(crate) mod curves;
 pub(crate) mod history;

@@ -205,6 +205,9 @@ pub async fn run(config: Config, faults: Option<mpsc::Sender<Fault>>) -> Result<
         api: Some(format!("http://{api}")),
         labels: config.labels.clone(),
         version: env!("CARGO_PKG_VERSION").to_owned(),
+        audit_bytes_max: config.audit_bytes_max,
+        webhooks: config.webhooks.clone(),
+        host_alarms: config.host_alarms,
     })
     .map_err(|e| Error::start("deployment", e))?;
     // Set once, here; nobody else could have.

@@ -28,6 +28,18 @@
 //! [lab]                            # for the operator's page
 //! reports = "lab-out"              # folder of reports; beside this file
 //!
+//! [audit]                          # who changed what
+//! bytes_max_mib = 256              # then the oldest entries go, and an entry says so
+//!
+//! [alarms]                         # of the host itself
+//! clock_offset_max_ms = 1000
+//! disk_free_min_mib = 512
+//!
+//! [[webhook]]                      # who is told of alarms of loops at home here
+//! name = "pager"
+//! url = "http://192.0.2.7:8080/alarms"
+//! priority = "medium"              # and what is more urgent
+//!
 //! [testing]                        # a test device; only in a cell whose name begins with "test"
 //! flip_bits_every = 100            # every so-manieth step of this host comes out with a bit turned over
 //!
@@ -52,6 +64,7 @@ use std::{
 };
 
 use bumpless_core::{CellName, HostId};
+use bumpless_deploy::{HostAlarms, webhook::WebhookConfig};
 use bumpless_io::BusConfig;
 use bumpless_scada::ModbusServerConfig;
 use serde::{Deserialize, Serialize};
@@ -102,6 +115,12 @@ pub struct Config {
     pub otlp: Option<bumpless_telemetry::Config>,
     /// Folder of the lab's reports, for the operator's page.
     pub lab_reports: Option<PathBuf>,
+    /// Bytes on disk for the audit trail.
+    pub audit_bytes_max: u64,
+    /// From when on the host's own clock and disk are alarms.
+    pub host_alarms: HostAlarms,
+    /// Who is told of alarms.
+    pub webhooks: Vec<WebhookConfig>,
     /// Points and loops of the cell as Modbus registers.
     pub modbus_servers: Vec<ModbusServerConfig>,
 }
@@ -137,6 +156,12 @@ pub(crate) struct File {
     otlp: Option<bumpless_telemetry::Config>,
     #[serde(default)]
     lab: LabTable,
+    #[serde(default)]
+    audit: AuditTable,
+    #[serde(default)]
+    alarms: HostAlarms,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    webhook: Vec<WebhookConfig>,
     #[serde(default, skip_serializing_if = "TestingTable::is_empty")]
     testing: TestingTable,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
@@ -234,6 +259,29 @@ impl Default for HistoryTable {
             enabled: true,
             bytes_max_mib: 512,
         }
+    }
+}
+
+/// The audit trail.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+struct AuditTable {
+    bytes_max_mib: u64,
+}
+
+impl Default for AuditTable {
+    fn default() -> Self {
+        // Half a million entries: years of a plant where people act a few times an hour.
+        Self { bytes_max_mib: 256 }
+    }
+}
+
+impl AuditTable {
+    fn checked(&self, wrong: &dyn Fn(&str, String) -> Error) -> Result<u64, Error> {
+        let range = bumpless_store::AUDIT_BYTES_MAX;
+        let (low, high) = (range.start() >> 20, range.end() >> 20);
+        let mib = in_range(wrong, "audit.bytes_max_mib", Some(self.bytes_max_mib), 0, low, high)?;
+        Ok(mib << 20)
     }
 }
 
@@ -362,6 +410,9 @@ impl File {
             history_bytes_max: self.history.checked(&wrong)?,
             otlp: self.otlp,
             lab_reports: self.lab.reports(folder),
+            audit_bytes_max: self.audit.checked(&wrong)?,
+            host_alarms: itself::alarms(self.alarms, &wrong)?,
+            webhooks: itself::webhooks(self.webhook, folder, &wrong)?,
             modbus_servers,
         })
     }

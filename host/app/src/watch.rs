@@ -6,6 +6,7 @@
 //! ```
 //! Never: disturbs the loop; whoever watches too slowly is told how many records were lost.
 
+mod alarms;
 mod feed;
 mod lines;
 mod screen;
@@ -20,6 +21,7 @@ use crate::{
     client::{Client, encoded},
     error::Error,
 };
+pub(crate) use alarms::alarms;
 use story::Story;
 
 /// Follows a loop until the reader has seen enough.

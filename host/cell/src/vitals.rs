@@ -47,4 +47,6 @@ pub struct Vitals {
     pub labels: Vec<String>,
     /// Version of the program.
     pub version: String,
+    /// Now by its steady clock, in ms of Unix time: what its records are stamped with. People are told where it is off.
+    pub unix_ms: u64,
 }

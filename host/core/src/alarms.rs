@@ -74,6 +74,10 @@ pub enum Kind {
     Dissent,
     /// Raised by the controller itself.
     Controller,
+    /// A host's clock is off: by itself, or beside those of the other hosts.
+    Clock,
+    /// A host's disk is nearly full, or refuses what it is given.
+    Disk,
 }
 
 impl Kind {

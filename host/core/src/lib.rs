@@ -6,7 +6,8 @@
 //! same code runs in a host, in a test and under a model checker.
 //!
 //! Reading order: the nouns (`name` to `record`), the messages (`protocol`), then the decisions along one cycle
-//! (`tick`, `desk` with `arbiter`, `seat` with `select`, `vote` and `swap`, `guard`), then `place`, `indices` and `alarms`.
+//! (`tick`, `desk` with `arbiter`, `seat` with `select`, `vote` and `swap`, `guard`), then `place`, `indices`, `alarms` and
+//! `audit`.
 
 pub mod limits;
 
@@ -26,6 +27,7 @@ pub mod wiring;
 
 pub mod alarms;
 pub mod arbiter;
+pub mod audit;
 pub mod chatter;
 pub mod damping;
 pub mod desk;

@@ -10,12 +10,15 @@
 
 use std::{
     collections::{BTreeMap, BTreeSet},
-    sync::{Arc, atomic::AtomicU64},
+    sync::{
+        Arc,
+        atomic::{AtomicU64, Ordering},
+    },
 };
 
 use bumpless_core::{
     HostId, LoopId,
-    alarms::{Board, Change, Definition, Flood, Shelf, Standing},
+    alarms::{Board, Change, Definition, Flood, Kind, Shelf, Standing},
 };
 use parking_lot::Mutex;
 use serde::{Deserialize, Serialize};
@@ -24,12 +27,15 @@ use tokio::sync::broadcast;
 use crate::{
     book::on_disk,
     error::Error,
-    limits::ALARM_EVENTS,
+    limits::{ALARM_EVENTS, ALARM_NUMBERS_SKIPPED},
     room::Room,
-    wire::{AlarmAsk, Told},
+    wire::{AlarmAsk, Notice, Told},
 };
 
+mod load;
 mod watch;
+
+pub use load::{AlarmLoad, FrequentAlarm};
 
 /// One alarm of the cell.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -47,6 +53,8 @@ pub struct AlarmView {
 /// Something happened to an alarm.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct AlarmEvent {
+    /// Its number at the home: greater than that of everything that it told before, also before it was started again.
+    pub number: u64,
     /// The loop.
     pub loop_id: LoopId,
     /// Its home.
@@ -104,6 +112,8 @@ pub(crate) struct Alarms {
     /// Loops whose boards the disk does not have as they are.
     pub(crate) dirty: Mutex<BTreeSet<LoopId>>,
     events: broadcast::Sender<Arc<AlarmEvent>>,
+    /// The last number that was given.
+    number: AtomicU64,
     /// Records that passed unseen because there were more than fit between two looks.
     pub(crate) missed: AtomicU64,
 }
@@ -114,6 +124,7 @@ impl Default for Alarms {
             boards: Mutex::default(),
             dirty: Mutex::default(),
             events: broadcast::Sender::new(ALARM_EVENTS),
+            number: AtomicU64::new(0),
             missed: AtomicU64::new(0),
         }
     }
@@ -125,11 +136,25 @@ impl Alarms {
         self.events.subscribe()
     }
 
-    fn tell(&self, events: &[AlarmEvent]) {
-        for event in events {
-            // Nobody listening is no error.
-            let _ = self.events.send(Arc::new(event.clone()));
-        }
+    /// Goes on behind what is on disk, and behind what was told and may not have come there.
+    pub(crate) fn number_on(&self, last_on_disk: u64) {
+        let next = last_on_disk.saturating_add(ALARM_NUMBERS_SKIPPED);
+        self.number.fetch_max(next, Ordering::Relaxed);
+    }
+
+    /// The last number that was given.
+    pub(crate) fn last_number(&self) -> u64 {
+        self.number.load(Ordering::Relaxed)
+    }
+
+    fn next_number(&self) -> u64 {
+        self.number.fetch_add(1, Ordering::Relaxed) + 1
+    }
+
+    /// Passes on what happened at another home.
+    pub(crate) fn heard(&self, event: AlarmEvent) {
+        // Nobody listening is no error.
+        let _ = self.events.send(Arc::new(event));
     }
 }
 
@@ -157,6 +182,11 @@ impl Room {
                 flood.is_flood = flood.comings > bumpless_core::alarms::FLOOD_ALARMS;
                 Ok(Told::Alarms(alarms, flood))
             }
+            AlarmAsk::Show(loop_id, alarm) => {
+                let boards = self.alarms.boards.lock();
+                let standing = boards.get(&loop_id).and_then(|board| board.get(&alarm)).cloned();
+                Ok(self.told(loop_id, standing))
+            }
             AlarmAsk::Past(max) => {
                 let store = self.store.clone();
                 let past = on_disk(move || store.alarm_changes::<AlarmEvent>(max as usize)).await??;
@@ -171,37 +201,51 @@ impl Room {
                 let changes = self.act(&loop_id, &alarm, act, &by)?;
                 self.keep_alarms(BTreeSet::from([loop_id.clone()]), changes.clone())
                     .await?;
-                let board = self.alarms.boards.lock();
-                let standing = board.get(&loop_id).and_then(|board| board.get(&alarm)).cloned();
-                Ok(Told::Alarms(
-                    standing
-                        .map(|standing| AlarmView {
-                            loop_id,
-                            host: self.here.clone(),
-                            now_ns: self.alarm_clock_ns(),
-                            standing,
-                        })
-                        .into_iter()
-                        .collect(),
-                    Flood {
-                        comings: 0,
-                        is_flood: false,
-                    },
-                ))
+                let standing = {
+                    let boards = self.alarms.boards.lock();
+                    boards.get(&loop_id).and_then(|board| board.get(&alarm)).cloned()
+                };
+                Ok(self.told(loop_id, standing))
             }
         }
     }
 
+    /// One alarm, or none, as an answer.
+    fn told(&self, loop_id: LoopId, standing: Option<Standing>) -> Told {
+        let view = standing.map(|standing| AlarmView {
+            loop_id,
+            host: self.here.clone(),
+            now_ns: self.alarm_clock_ns(),
+            standing,
+        });
+        let none = Flood {
+            comings: 0,
+            is_flood: false,
+        };
+        Told::Alarms(view.into_iter().collect(), none)
+    }
+
     fn act(&self, loop_id: &LoopId, alarm: &str, act: AlarmAct, by: &str) -> Result<Vec<AlarmEvent>, Error> {
-        let intent = self.book.find(loop_id)?;
-        if intent.home != self.here {
+        let own = self.own_board().as_ref() == Some(loop_id);
+        let intent = if own { None } else { Some(self.book.find(loop_id)?) };
+        if intent.as_ref().is_some_and(|intent| intent.home != self.here) {
             return Err(Error::refused(
                 format!("host {} is not the home of loop {loop_id}", self.here),
                 "ask again",
             ));
         }
         if let AlarmAct::Define(definition) = &act
+            && own
+            && !matches!(definition.kind, Kind::Clock | Kind::Disk)
+        {
+            return Err(Error::invalid(
+                format!("alarm {alarm:?}: {loop_id} is a host and no loop"),
+                "a host has alarms of the kinds clock and disk",
+            ));
+        }
+        if let AlarmAct::Define(definition) = &act
             && let Some(port) = &definition.port
+            && let Some(intent) = &intent
             && let Some(info) = self.library.get(&intent.current.digest)
             && info.descriptor.port(port).is_none()
         {
@@ -244,21 +288,30 @@ impl Room {
             bumpless_core::alarms::AlarmError::State { .. } => Error::refused(error.to_string(), "look at it again"),
             other => Error::invalid(other.to_string(), ""),
         })?;
-        Ok(vec![AlarmEvent {
+        Ok(vec![self.happened(loop_id, change)])
+    }
+
+    /// A change of an alarm here, with its number.
+    pub(crate) fn happened(&self, loop_id: &LoopId, change: Change) -> AlarmEvent {
+        AlarmEvent {
+            number: self.alarms.next_number(),
             loop_id: loop_id.clone(),
             host: self.here.clone(),
             change,
-        }])
+        }
     }
 
     /// The clock that records of loops at home here are stamped with.
-    fn alarm_clock_ns(&self) -> u64 {
+    pub(crate) fn alarm_clock_ns(&self) -> u64 {
         self.io.as_ref().map_or(self.clock, |io| io.clock()).now_ns()
     }
 
     /// Brings boards and what happened to the disk, and tells it.
-    async fn keep_alarms(&self, loops: BTreeSet<LoopId>, events: Vec<AlarmEvent>) -> Result<(), Error> {
-        self.alarms.tell(&events);
+    pub(crate) async fn keep_alarms(&self, loops: BTreeSet<LoopId>, events: Vec<AlarmEvent>) -> Result<(), Error> {
+        for event in &events {
+            self.announce(&Notice::Alarm(Box::new(event.clone())));
+            self.alarms.heard(event.clone());
+        }
         let boards: Vec<(String, Board)> = {
             let boards = self.alarms.boards.lock();
             loops
@@ -267,7 +320,8 @@ impl Room {
                 .collect()
         };
         let store = self.store.clone();
-        on_disk(move || store.keep_alarms(&boards, &events)).await??;
+        let numbered: Vec<(u64, AlarmEvent)> = events.into_iter().map(|event| (event.number, event)).collect();
+        on_disk(move || store.keep_alarms(&boards, &numbered)).await??;
         Ok(())
     }
 }

@@ -74,6 +74,9 @@ impl Room {
                 }
                 Ask::Shadow(id, ask) => self.shadow_here(&from, id, ask).await,
                 Ask::Alarm(ask) => self.alarms_here(ask).await,
+                Ask::Webhooks => Ok(Told::Webhooks(self.webhooks.views())),
+                Ask::AlarmLoad => self.alarm_load_here().await.map(Box::new).map(Told::AlarmLoad),
+                Ask::Audit(ask) => self.audit_here(ask).await,
                 Ask::Rollout(ask) => self.rollout_here(ask).await,
                 Ask::Field(ask) => self.field_here(*ask).await.map(Box::new).map(Told::Field),
                 Ask::Records(ids) => {

@@ -24,6 +24,7 @@ use tracing::{Instrument as _, info_span};
 
 use crate::{
     SPANS, admission,
+    audit::{Act, AuditKind},
     bench::stopping,
     change::readiness::Readiness,
     draft::LoopDraft,
@@ -241,7 +242,7 @@ impl Room {
     /// failure but the log; the next failing cycles ask again.
     pub(crate) fn fall_back(self: &Arc<Self>, failing: &Record) {
         let (id, revision, faults) = (failing.loop_id.clone(), failing.revision, failing.faults_in_row);
-        let room = Arc::clone(self);
+        let (room, spawned) = (Arc::clone(self), Arc::clone(self));
         self.spawn(async move {
             let name = id.clone();
             let end = room.in_turn(id.clone(), move |room| async move {
@@ -258,7 +259,12 @@ impl Room {
                 let spec = plan::complete(spec, &new.descriptor, &room.ground(&facts))?;
                 room.change(intent, spec, &new, dropped).await
             });
-            match end.await {
+            let end = end.await;
+            let seen = spawned.revised(&end).await;
+            let asked = serde_json::json!({ "failed_revision": revision, "faults_in_row": faults });
+            let act = Act::on_loop(AuditKind::LoopFallback, &name, asked);
+            spawned.audit_own(act, seen, end.as_ref().err()).await;
+            match end {
                 Ok(end) => tracing::error!(
                     loop_id = %name, failed = revision, revision = end.revision, faults,
                     "the loop's component kept failing; its fallback runs now"

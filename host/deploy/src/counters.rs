@@ -1,13 +1,13 @@
-//! What a host counts, gathered for monitoring.
+//! What a host counts, gathered when somebody asks.
 //!
-//! Never: counts; whoever does something counts it.
+//! Never: counts; those who do the work do.
 
 use std::{
     sync::atomic::{AtomicU64, Ordering},
     time::Instant,
 };
 
-use crate::{room::Room, view::Counters};
+use crate::{alarms::AlarmLoad, room::Room, view::Counters};
 
 impl Room {
     /// What this host counts.
@@ -42,8 +42,26 @@ impl Room {
             cycles_unrecorded: log.dropped,
             cycle_log_damaged: log.damaged,
             cycle_log_bytes: log.bytes,
+            audit_entries: self.audit.head().number,
+            audit_bytes: self.audit.head().bytes,
+            audit_waiting: self.audit.waiting() as u64,
+            audit_refused: get(&self.audit.refused),
+            audit_lost: get(&self.audit.lost),
+            clock_offset_ms: self.self_watch.offset_ms(),
+            disk_free_bytes: self.self_watch.free_bytes(),
+            webhooks: self.webhooks.views(),
             ..Counters::default()
         };
+        {
+            let now_ns = self.alarm_clock_ns();
+            let boards = self.alarms.boards.lock();
+            let load = AlarmLoad::of(&[], boards.values().flat_map(bumpless_core::alarms::Board::all), now_ns);
+            counters.alarms_standing = load.standing;
+            counters.alarms_unacknowledged = load.unacknowledged;
+            counters.alarms_stale = load.stale;
+            counters.alarms_quiet = load.quiet;
+            counters.alarms_recent = boards.values().map(|board| board.flood(now_ns).comings as u64).sum();
+        }
         for intent in self.book.all().iter().filter(|intent| intent.home == self.here) {
             counters.loops_home += 1;
             if let Some(view) = self.field.home_view(&intent.loop_id) {

@@ -113,6 +113,11 @@ impl Feed {
         self.count.load(Ordering::Relaxed)
     }
 
+    /// Writes of last records that the disk refused.
+    pub(crate) fn failed_writes(&self) -> u64 {
+        self.writer.counts().failed_writes
+    }
+
     /// Brings the last records to the disk. Blocks.
     pub(crate) fn flush(&self) -> Result<(), bumpless_store::Error> {
         self.writer.flush()

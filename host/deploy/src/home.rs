@@ -25,6 +25,7 @@ use parking_lot::Mutex;
 use tokio::task::JoinSet;
 
 use crate::{
+    audit::{Act, AuditKind},
     bench::wire_up,
     error::Error,
     holder::{wanted_members, wanted_revisions},
@@ -382,7 +383,7 @@ impl Room {
     /// Outside of a change: the arbiter took a record of another revision than the intent has in force, because a probation
     /// went back; or a change ended without being able to clear up, because the disk was full. A change that is under way
     /// settles for itself.
-    async fn settle(&self, intent: &Intent) -> Result<(), Error> {
+    async fn settle(self: &Arc<Self>, intent: &Intent) -> Result<(), Error> {
         let id = &intent.loop_id;
         if self.unsettled(id).is_none() && intent.pending.is_none() {
             return Ok(());
@@ -393,13 +394,17 @@ impl Room {
     }
 
     /// As [`Room::settle`], for a caller that has the loop's lock.
-    pub(crate) async fn settle_locked(&self, id: &LoopId) -> Result<(), Error> {
+    pub(crate) async fn settle_locked(self: &Arc<Self>, id: &LoopId) -> Result<(), Error> {
         let held = self.book.find(id)?;
         let mut intent = (*held).clone();
         let revised = self.unsettled(id);
         match revised.map(|revision| intent.commit(revision)) {
             Some(Ok(true)) => {
                 tracing::info!(loop_id = %id, revision = intent.current.revision, "the loop went on with another revision by itself");
+                let seen = self.seen_revision(&intent, intent.current.revision);
+                let asked = serde_json::json!({ "left_revision": held.current.revision });
+                let act = Act::on_loop(AuditKind::LoopWentBack, id, asked);
+                self.audit_own(act, seen, None).await;
             }
             Some(Err(error)) => tracing::error!(loop_id = %id, %error, "the loop runs a revision that nobody knows"),
             Some(Ok(false)) | None => {}

@@ -18,13 +18,14 @@
 //! `book`, `library`, `roster`, `feed` (what it keeps); `admission`, `bench`, `holder`, `home`, `preference`, `drain`, `expect`,
 //! `change`, `orders`, `health` (what it does);
 //! `trials` with `rehearsal`, `verdict`, `replay`, `shadows`, `curve`, `report` (looking back, and trying candidates);
-//! `rollout` (one component for many loops, by rule);
+//! `rollout` (one component for many loops, by rule); `audit` (who changed what); `webhook`, `self_watch`;
 //! `sync`, `answers`, `service`, `room`, `deploy` (how it hangs together).
 
 mod admission;
 pub mod alarms;
 mod answers;
 mod aside;
+pub mod audit;
 mod bench;
 mod book;
 mod bundle;
@@ -49,6 +50,7 @@ mod rehearsal;
 mod replay;
 mod room;
 mod roster;
+mod self_watch;
 mod service;
 mod shadows;
 mod sync;
@@ -56,6 +58,7 @@ mod telling;
 mod trials;
 mod uploads;
 mod verdict;
+pub mod webhook;
 mod wire;
 
 pub mod commissioning;
@@ -78,6 +81,7 @@ pub use field::{CallSink, CommandSink, Field, WithdrawSink};
 pub use health::{Check, HealthView};
 pub use library::plant_bytes;
 pub use room::{DeployArrival, Parts};
+pub use self_watch::HostAlarms;
 pub use view::{
     ApplyEnd, Call, CallEnd, CommandEnd, ComponentView, Counters, DrainEnd, DrainOrder, FailureView, HandOverView,
     HostView, Imported, LoopView, PointView, Relabel, Stage, StageView, Upload,

@@ -252,5 +252,48 @@ pub const CALL_WAIT: Duration = Duration::from_secs(5);
 /// Changes of alarms that a live listener may lag behind; it then loses the oldest, and the list says how things stand.
 pub const ALARM_EVENTS: usize = 1_024;
 
+/// Numbers of alarm events that a start passes over: more than a home tells while its disk refuses them.
+pub const ALARM_NUMBERS_SKIPPED: u64 = 1_000_000;
+
+/// Webhooks of one host: each has a queue, and a thread while it tells.
+pub const WEBHOOKS_MAX: usize = 8;
+
+/// Shortest and longest pause before a receiver that did not take an event is tried again.
+pub const WEBHOOK_BACK_OFF: (Duration, Duration) = (Duration::from_secs(1), Duration::from_secs(60));
+
+/// Past changes of alarms that the figures of a day are made of: an operator who had a tenth of them read none.
+pub const ALARM_LOAD_EVENTS_MAX: usize = 20_000;
+
+/// How often a host looks at its own clock and disk.
+pub const SELF_LOOK_EVERY: Duration = Duration::from_secs(1);
+
+/// How long a write that the disk refused is an alarm, after the last one.
+pub const SELF_REFUSED_FOR: Duration = Duration::from_secs(30);
+
 /// Past changes of alarms in one answer: a few MB.
 pub const ALARM_PAST_MAX: u32 = 10_000;
+
+/// Entries of the audit trail that wait for a disk that refuses them: half a megabyte or so; then the oldest is dropped.
+pub const AUDIT_WAITING_MAX: usize = 1_000;
+
+/// Pause before the disk is tried again.
+pub const AUDIT_RETRY: Duration = Duration::from_secs(5);
+
+/// Changes that failed, with entries of their own within [`AUDIT_FAILURES_WINDOW`]; more are only counted, so that who keeps
+/// knocking does not push out what was done.
+pub const AUDIT_FAILURES_MAX: u32 = 100;
+
+/// See [`AUDIT_FAILURES_MAX`].
+pub const AUDIT_FAILURES_WINDOW: Duration = Duration::from_secs(10);
+
+/// Entries of one list: some 500 KB.
+pub const AUDIT_LIST_MAX: u32 = 1_000;
+
+/// Segments of 4 MiB that one list looks through on a host; whoever wants more asks again, from there.
+pub const AUDIT_LOOKED_SEGMENTS_MAX: usize = 16;
+
+/// Bytes of lines in one answer of a host.
+pub const AUDIT_REPLY_BYTES: usize = 2 * 1024 * 1024;
+
+/// How long a host may take to verify its chain: 256 MiB at 20 MB/s.
+pub const AUDIT_VERIFY_WAIT: Duration = Duration::from_secs(25);

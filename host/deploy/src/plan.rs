@@ -12,6 +12,7 @@ use bumpless_core::{
 use crate::{
     draft::{Change, LoopDraft},
     error::{Error, Words},
+    self_watch::HOST_BOARD,
 };
 
 /// What a plan needs to know of a point.
@@ -42,6 +43,13 @@ pub(crate) fn loop_id(name: &str) -> Result<LoopId, Error> {
     if id.as_str() == "call" {
         return Err(Error::invalid(
             "\"call\" cannot be the name of a loop, the host uses it itself",
+            "choose another name",
+        ));
+    }
+    // The alarms of a host itself stand under this name.
+    if id.as_str().starts_with(HOST_BOARD) {
+        return Err(Error::invalid(
+            format!("{id:?} cannot be the name of a loop, names that begin with {HOST_BOARD:?} are the hosts' own"),
             "choose another name",
         ));
     }

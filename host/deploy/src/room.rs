@@ -32,6 +32,7 @@ use tokio::{
 
 use crate::{
     alarms::Alarms,
+    audit::Audit,
     bench::Bench,
     book::Book,
     commissioning::Commissioning,
@@ -46,8 +47,10 @@ use crate::{
     limits::{CHANGES_MAX, NOTICES_WAITING_MAX, RECONCILE_EVERY, REHEARSALS_MAX, SENDING_MAX, UPLOADS_MAX},
     rollout::ledger::Ledger,
     roster::Roster,
+    self_watch::{HostAlarms, SelfWatch},
     shadows::Shadows,
     telling::LastTold,
+    webhook::{self, WebhookConfig, Webhooks},
     wire::{self, Ask, Notice, Told},
 };
 
@@ -77,6 +80,12 @@ pub struct Parts {
     pub labels: Vec<String>,
     /// Version of the program.
     pub version: String,
+    /// Bytes on disk for the audit trail, within [`bumpless_store::AUDIT_BYTES_MAX`].
+    pub audit_bytes_max: u64,
+    /// Who is told of alarms; at most [`crate::limits::WEBHOOKS_MAX`].
+    pub webhooks: Vec<WebhookConfig>,
+    /// From when on the host's own clock and disk are alarms.
+    pub host_alarms: HostAlarms,
 }
 
 /// What reaches deployment.
@@ -150,6 +159,9 @@ pub(crate) struct Room {
     pub(crate) shadows: Shadows,
     pub(crate) rollouts: Ledger,
     pub(crate) alarms: Alarms,
+    pub(crate) audit: Audit,
+    pub(crate) webhooks: Webhooks,
+    pub(crate) self_watch: SelfWatch,
     pub(crate) commissioning: Commissioning,
     /// Whether the disk takes writes, as it was when it was last tried.
     pub(crate) disk: Disk,
@@ -199,6 +211,9 @@ impl Room {
             api,
             labels,
             version,
+            audit_bytes_max,
+            webhooks,
+            host_alarms,
         } = parts;
         // A host that was to stay empty over its restart says so from its first word on.
         let drain_kept = store.host_value::<bool>(drain::KEPT)?.unwrap_or(false);
@@ -219,10 +234,13 @@ impl Room {
             drain_kept,
             labels,
             version,
+            unix_ms: clock.unix_ms(),
         };
         let (notices, arrived) = mpsc::channel(NOTICES_WAITING_MAX);
         let told = Arc::clone(&field);
         writer.tell_on_disk(Box::new(move |id, position| told.kept(id, position).is_ok()));
+        let (audit, found) = Audit::open(&store, &here, audit_bytes_max)?;
+        let (webhooks, hooks) = webhook::ready(webhooks, &here)?;
         let book = Book::open(store.clone())?;
         let library = Library::open(store.clone())?;
         let room = Arc::new(Self {
@@ -235,6 +253,9 @@ impl Room {
             shadows: Shadows::default(),
             rollouts: Ledger::default(),
             alarms: Alarms::default(),
+            audit,
+            webhooks,
+            self_watch: SelfWatch::new(host_alarms),
             commissioning: Commissioning::new(&store, clock)?,
             disk: Disk::default(),
             rehearsals: Semaphore::new(REHEARSALS_MAX),
@@ -276,7 +297,10 @@ impl Room {
         room.spawn(Self::reconcile_holds(Arc::clone(&room)));
         room.spawn(Self::prepare_ahead(Arc::clone(&room)));
         room.spawn(Self::hear_notices(Arc::clone(&room), arrived));
+        room.begin_audit(&found);
         room.read_alarms()?;
+        room.begin_webhooks(hooks);
+        room.spawn(Self::watch_self(Arc::clone(&room)));
         room.spawn(Self::watch_alarms(Arc::clone(&room), room.feed.subscribe()));
         room.resume_rollouts()?;
         room.resume_forces()?;
@@ -376,12 +400,14 @@ impl Room {
             DeployArrival::Bus(Arrival::HostDown(host)) => self.host_down(&host),
             DeployArrival::Bus(Arrival::Vitals(vitals)) => {
                 self.field.set_host(&vitals);
+                self.self_watch.heard(&vitals, self.clock.unix_ms());
                 if self.roster.vitals(vitals) {
                     self.poke();
                 }
             }
             DeployArrival::Bus(Arrival::Notice { from, payload }) => match wire::decode::<Notice>("notice", &payload) {
                 Ok(Notice::Field(event)) => self.commissioning.tell(*event),
+                Ok(Notice::Alarm(event)) => self.alarms.heard(*event),
                 Ok(notice) => {
                     if self.notices.try_send((from, notice)).is_err() {
                         count(&self.tallies.arrivals_dropped);

@@ -217,6 +217,7 @@ pub(crate) fn test_vitals(host: &HostId) -> Vitals {
         loops_held: 0,
         draining: false,
         drain_kept: false,
+        unix_ms: 0,
         labels: Vec::new(),
         version: String::new(),
     }

@@ -104,6 +104,7 @@ impl Room {
     fn vitals(&self) -> Vitals {
         let mut own = self.own.lock();
         own.seq += 1;
+        own.unix_ms = self.clock.unix_ms();
         own.ready = self.bench.ready();
         own.loops_owned = self.field.owned();
         own.loops_held = u32::try_from(self.holder.len()).unwrap_or(u32::MAX);

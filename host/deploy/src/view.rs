@@ -299,7 +299,7 @@ pub struct CallEnd {
 }
 
 /// What this host counts, for metrics. Counts only grow until the process ends; the others are as of now.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Counters {
     /// Hosts that are alive, this one included (as of now).
     pub hosts_alive: u64,
@@ -355,4 +355,30 @@ pub struct Counters {
     pub cycle_log_damaged: u64,
     /// Bytes of the log (as of now).
     pub cycle_log_bytes: u64,
+    /// Entries of the audit trail, those that were removed too.
+    pub audit_entries: u64,
+    /// Bytes of the audit trail on disk (as of now).
+    pub audit_bytes: u64,
+    /// Entries that wait for the disk (as of now).
+    pub audit_waiting: u64,
+    /// Times that the disk refused entries.
+    pub audit_refused: u64,
+    /// Entries that were lost because the disk refused them for too long.
+    pub audit_lost: u64,
+    /// Alarms that stand and are not kept quiet, loops at home here (as of now).
+    pub alarms_standing: u64,
+    /// Alarms that wait for a person (as of now).
+    pub alarms_unacknowledged: u64,
+    /// Alarms that stand for more than a day (as of now).
+    pub alarms_stale: u64,
+    /// Alarms that are shelved, suppressed, or out of service (as of now).
+    pub alarms_quiet: u64,
+    /// Alarms that came in the last ten minutes (as of now).
+    pub alarms_recent: u64,
+    /// How far this host's clock is off, in ms (as of now).
+    pub clock_offset_ms: i64,
+    /// Room on the disk, in bytes (as of now); none where it is not known.
+    pub disk_free_bytes: Option<u64>,
+    /// How its webhooks do.
+    pub webhooks: Vec<crate::webhook::WebhookView>,
 }

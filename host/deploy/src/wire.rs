@@ -13,7 +13,8 @@ use bumpless_store::{Tombstone, Window};
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
 use crate::{
-    alarms::{AlarmAct, AlarmEvent, AlarmView},
+    alarms::{AlarmAct, AlarmEvent, AlarmLoad, AlarmView},
+    audit::{AuditAsk, AuditPage, AuditVerdict, Looked},
     commissioning::{FieldAsk, FieldEvent, FieldTold},
     draft::{Change, LoopDraft},
     error::{Error, Words},
@@ -22,6 +23,7 @@ use crate::{
     report::{CyclesView, ReplayReport, ShadowView, Trial, TrialReport},
     rollout::RolloutView,
     view::{ApplyEnd, CommandEnd, DrainEnd, DrainOrder, PointView, Stage},
+    webhook::WebhookView,
 };
 
 /// Version of these lists. Another one is refused in words, so that a half updated cell says what is the matter.
@@ -95,6 +97,12 @@ pub(crate) enum Ask {
     Alarm(AlarmAsk),
     /// To an I/O host: these points now, at most a page of them.
     Read(Vec<PointId>),
+    /// About the audit trail of the host.
+    Audit(AuditAsk),
+    /// How its webhooks do.
+    Webhooks,
+    /// How many alarms its operators had lately.
+    AlarmLoad,
 }
 
 /// What may be asked about alarms.
@@ -102,6 +110,8 @@ pub(crate) enum Ask {
 pub(crate) enum AlarmAsk {
     /// All of them.
     List,
+    /// One.
+    Show(LoopId, String),
     /// What happened, newest first, at most so much.
     Past(u32),
     /// A person does something.
@@ -219,6 +229,16 @@ pub(crate) enum Told {
     Alarms(Vec<AlarmView>, Flood),
     /// What happened to alarms.
     AlarmPast(Vec<AlarmEvent>),
+    /// How webhooks do.
+    Webhooks(Vec<WebhookView>),
+    /// How many alarms operators had lately.
+    AlarmLoad(Box<AlarmLoad>),
+    /// Entries of the audit trail, newest first.
+    Audit(Looked),
+    /// A stretch of the audit trail.
+    AuditPage(AuditPage),
+    /// Whether the audit trail fits.
+    AuditVerdict(Box<AuditVerdict>),
     /// Readings in the order asked, with the age of each value in ns; none for points that are not here.
     Read(Vec<Option<(Reading, u64)>>),
     /// What was asked about points, buses, forces and jobs.
@@ -248,6 +268,8 @@ pub(crate) enum Notice {
     Gone(Tombstone),
     /// Something happened to a point or a job.
     Field(Box<FieldEvent>),
+    /// Something happened to an alarm of a loop at home there.
+    Alarm(Box<AlarmEvent>),
 }
 
 /// A value with its version.

@@ -201,7 +201,12 @@ impl Registers for Face {
             Ok(orders) => orders,
             Err(refusal) => {
                 let exception = self.refused(client, &refusal);
-                return Box::pin(std::future::ready(Err(exception)));
+                let (server, asked) = (self.name.clone(), format!("{write:?}"));
+                let noted = self.plant.refused(server, asked, refusal.reason, client.to_string());
+                return Box::pin(async move {
+                    noted.await;
+                    Err(exception)
+                });
             }
         };
         let (plant, server, client) = (Arc::clone(&self.plant), self.name.clone(), client.to_string());
@@ -229,18 +234,14 @@ impl Registers for Face {
 /// Brings one write into the cell.
 async fn done(plant: &dyn Plant, order: Order, client: &str) -> Result<(), Error> {
     match (order.source, order.item) {
-        (Source::Point { id, .. }, _) => {
-            plant
-                .write_point(id, order.value, format!("Modbus client {client}"))
-                .await
-        }
+        (Source::Point { id, .. }, _) => plant.write_point(id, order.value, client.to_owned()).await,
         (Source::Loop { id, .. }, Item::Mode) => {
             let mode = if order.value >= 0.5 {
                 Mode::Automatic
             } else {
                 Mode::Manual
             };
-            plant.command(id, CommandBody::Mode(mode)).await
+            plant.command(id, CommandBody::Mode(mode), client.to_owned()).await
         }
         (Source::Loop { id, output }, Item::Output) => {
             let missing = || Error::not_found(format!("loop {id} has no record and no output {output}"), "");
@@ -248,9 +249,13 @@ async fn done(plant: &dyn Plant, order: Order, client: &str) -> Result<(), Error
             // The others stay where the operator has put them.
             let mut outputs = record.manual.clone();
             *outputs.get_mut(output).ok_or_else(missing)? = order.value;
-            plant.command(id, CommandBody::Output(outputs)).await
+            plant.command(id, CommandBody::Output(outputs), client.to_owned()).await
         }
-        (Source::Loop { id, .. }, _) => plant.command(id, CommandBody::Setpoint(order.value)).await,
+        (Source::Loop { id, .. }, _) => {
+            plant
+                .command(id, CommandBody::Setpoint(order.value), client.to_owned())
+                .await
+        }
     }
 }
 

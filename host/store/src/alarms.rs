@@ -16,18 +16,23 @@ const CHANGES: TableDefinition<u64, &[u8]> = TableDefinition::new("alarm_changes
 pub const ALARM_CHANGES_MAX: u64 = 100_000;
 
 impl Store {
-    /// Keeps the boards, each in the place of what was there, and adds what happened. On disk when this returns.
+    /// Keeps the boards, each in the place of what was there, and adds what happened under its numbers, which grow. On disk when
+    /// this returns.
     ///
     /// # Errors
     /// [`Error::Row`] and [`Error::Size`] for what makes no row, [`Error::Io`], [`Error::Database`].
-    pub fn keep_alarms<B: Serialize, C: Serialize>(&self, boards: &[(String, B)], changes: &[C]) -> Result<(), Error> {
+    pub fn keep_alarms<B: Serialize, C: Serialize>(
+        &self,
+        boards: &[(String, B)],
+        changes: &[(u64, C)],
+    ) -> Result<(), Error> {
         let boards = boards
             .iter()
             .map(|(name, board)| Ok((name, format::encode(|| format!("alarms of {name}"), board)?)))
             .collect::<Result<Vec<_>, Error>>()?;
         let changes = changes
             .iter()
-            .map(|change| format::encode(|| "a change of an alarm".to_owned(), change))
+            .map(|(number, change)| Ok((*number, format::encode(|| "a change of an alarm".to_owned(), change)?)))
             .collect::<Result<Vec<_>, Error>>()?;
         self.inner.base.write("write alarms to", Durability::Immediate, |txn| {
             let mut table = txn.open_table(BOARDS)?;
@@ -35,9 +40,7 @@ impl Store {
                 table.insert(name.as_str(), row.as_slice())?;
             }
             let mut table = txn.open_table(CHANGES)?;
-            let mut number = table.last()?.map_or(0, |(number, _)| number.value());
-            for row in &changes {
-                number += 1;
+            for (number, row) in &changes {
                 table.insert(number, row.as_slice())?;
             }
             while table.len()? > ALARM_CHANGES_MAX {
@@ -71,6 +74,44 @@ impl Store {
                 let board = self.row("alarms", &name, row)?;
                 Some((name, board))
             })
+            .collect())
+    }
+
+    /// The greatest number of what happened; 0 where nothing did.
+    ///
+    /// # Errors
+    /// [`Error::Io`], [`Error::Database`].
+    pub fn last_alarm_change(&self) -> Result<u64, Error> {
+        self.inner
+            .base
+            .read("read the alarms' changes from", |txn| match txn.open_table(CHANGES) {
+                Ok(table) => Ok(table.last()?.map_or(0, |(number, _)| number.value())),
+                Err(TableError::TableDoesNotExist(_)) => Ok(0),
+                Err(error) => Err(error.into()),
+            })
+    }
+
+    /// What happened after a number, oldest first, at most `max`. Rows that cannot be read are skipped.
+    ///
+    /// # Errors
+    /// [`Error::Io`], [`Error::Database`].
+    pub fn alarm_changes_after<C: DeserializeOwned>(&self, number: u64, max: usize) -> Result<Vec<C>, Error> {
+        let rows = self.inner.base.read("read the alarms' changes from", |txn| {
+            let table = match txn.open_table(CHANGES) {
+                Ok(table) => table,
+                Err(TableError::TableDoesNotExist(_)) => return Ok(Vec::new()),
+                Err(error) => return Err(error.into()),
+            };
+            let mut rows = Vec::new();
+            for row in table.range(number.saturating_add(1)..)?.take(max) {
+                let (number, value) = row?;
+                rows.push((number.value(), format::decode(value.value())));
+            }
+            Ok(rows)
+        })?;
+        Ok(rows
+            .into_iter()
+            .filter_map(|(number, row)| self.row("alarm changes", &number.to_string(), row))
             .collect())
     }
 

@@ -141,6 +141,9 @@ pub enum Error {
         /// Its name.
         name: String,
     },
+    /// A text that makes no entry of the audit trail.
+    #[error("an entry of the audit trail cannot be made: report this, it is a fault of the program")]
+    Audit(#[source] bumpless_core::audit::Misfit),
     /// The writer's thread did not answer in time.
     #[error("the record writer did not finish within {seconds} s: the disk of {} is too slow or stuck", path.display())]
     Slow {

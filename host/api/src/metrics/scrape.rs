@@ -4,6 +4,7 @@
 
 use std::{fmt, sync::Arc};
 
+use bumpless_deploy::webhook::WebhookView;
 use prometheus_client::{
     collector::Collector,
     encoding::{DescriptorEncoder, EncodeCounterValue, EncodeGaugeValue, EncodeMetric as _, NoLabelSet},
@@ -91,6 +92,17 @@ impl Collector for Scrape {
                 "Pieces of the log that could not be read",
                 c.cycle_log_damaged,
             ),
+            ("audit_entries", "Entries of this host's audit trail", c.audit_entries),
+            (
+                "audit_writes_refused",
+                "Times that the disk refused entries of the audit trail",
+                c.audit_refused,
+            ),
+            (
+                "audit_entries_lost",
+                "Entries of the audit trail that were dropped because the disk refused them for too long",
+                c.audit_lost,
+            ),
         ] {
             let metric = ConstCounter::new(value);
             metric.encode(encoder.encode_descriptor(name, help, None, metric.metric_type())?)?;
@@ -102,6 +114,36 @@ impl Collector for Scrape {
             ("loops_held", "Loops held here, owned or standing by", c.loops_held),
             ("loops_owned", "Loops owned here", c.loops_owned),
             ("components", "Components in the library", c.components),
+            (
+                "audit_entries_waiting",
+                "Entries of the audit trail that wait for the disk",
+                c.audit_waiting,
+            ),
+            (
+                "alarms_standing",
+                "Alarms that stand, homes here; what is kept quiet does not count",
+                c.alarms_standing,
+            ),
+            (
+                "alarms_unacknowledged",
+                "Alarms that wait for a person, homes here",
+                c.alarms_unacknowledged,
+            ),
+            (
+                "alarms_stale",
+                "Alarms that stand for more than a day, homes here",
+                c.alarms_stale,
+            ),
+            (
+                "alarms_quiet",
+                "Alarms that are shelved, suppressed or out of service, homes here",
+                c.alarms_quiet,
+            ),
+            (
+                "alarms_recent",
+                "Alarms that came in the last ten minutes, homes here; more than 10 is a flood",
+                c.alarms_recent,
+            ),
         ] {
             let metric = ConstGauge::new(value);
             metric.encode(encoder.encode_descriptor(name, help, None, metric.metric_type())?)?;
@@ -109,8 +151,64 @@ impl Collector for Scrape {
         let metric = ConstGauge::new(c.cycle_log_bytes);
         let help = "Recorded cycles on disk";
         metric.encode(encoder.encode_descriptor("cycle_log", help, Some(&Unit::Bytes), metric.metric_type())?)?;
+        let metric = ConstGauge::new(c.audit_bytes);
+        let help = "The audit trail on disk";
+        metric.encode(encoder.encode_descriptor("audit", help, Some(&Unit::Bytes), metric.metric_type())?)?;
+        let metric = ConstGauge::new(c.clock_offset_ms as f64 * 1e-3);
+        let help = "How far the host's clock is off, beside its own date and those of other hosts";
+        metric.encode(encoder.encode_descriptor(
+            "clock_offset",
+            help,
+            Some(&Unit::Seconds),
+            metric.metric_type(),
+        )?)?;
+        if let Some(free) = c.disk_free_bytes {
+            let metric = ConstGauge::new(free);
+            let help = "Room on the disk of the host's data";
+            metric.encode(encoder.encode_descriptor("disk_free", help, Some(&Unit::Bytes), metric.metric_type())?)?;
+        }
+        self.webhooks(&mut encoder, &c.webhooks)?;
         self.hosts(&mut encoder)?;
         self.loops(&mut encoder)
+    }
+}
+
+impl Scrape {
+    /// Those who are told of alarms.
+    fn webhooks(&self, encoder: &mut DescriptorEncoder<'_>, hooks: &[WebhookView]) -> fmt::Result {
+        let rows = |value: &dyn Fn(&WebhookView) -> u64| -> Vec<(String, u64)> {
+            hooks.iter().map(|hook| (hook.name.clone(), value(hook))).collect()
+        };
+        for (name, help, rows) in [
+            ("webhook_told", "Events that were told", rows(&|hook| hook.told)),
+            (
+                "webhook_failed",
+                "Tries to tell an event that failed",
+                rows(&|hook| hook.failed),
+            ),
+            (
+                "webhook_refused",
+                "Events that the receiver refused for good",
+                rows(&|hook| hook.refused),
+            ),
+            (
+                "webhook_dropped",
+                "Events that were dropped because too many waited",
+                rows(&|hook| hook.dropped),
+            ),
+        ] {
+            counters(encoder, (name, help), "webhook", &rows)?;
+        }
+        let waiting: Vec<(String, f64)> = hooks
+            .iter()
+            .map(|hook| (hook.name.clone(), hook.waiting as f64))
+            .collect();
+        gauges(
+            encoder,
+            ("webhook_waiting", "Events that wait", None),
+            "webhook",
+            &waiting,
+        )
     }
 }
 

@@ -20,7 +20,7 @@ use axum::{
     },
 };
 use bumpless_core::{LoopId, Record as CoreRecord};
-use bumpless_deploy::commissioning::FieldEvent;
+use bumpless_deploy::{alarms::AlarmEvent, commissioning::FieldEvent};
 use futures_util::stream;
 use serde::Deserialize;
 use tokio::{
@@ -38,7 +38,7 @@ use crate::{
     extract::InQuery,
     limits::{BEAT_MS_DEFAULT, BEAT_MS_MAX, BEAT_MS_MIN, FEED_LOOPS_MAX, HOSTS_EVERY, KEEP_ALIVE, TRACES_MAX},
     server::App,
-    types::{FieldNews, Hosts, Record},
+    types::{AlarmHappening, FieldNews, Hosts, Record},
 };
 
 use rows::{Mark, Rows, Wanted};
@@ -76,16 +76,17 @@ pub(crate) enum Form {
 }
 
 /// Follows the records. Events: `record` (a record), `hosts` (the hosts, every second, the first at once), `field` (what happened to a point
-/// or a job, as FieldNews), `lost` (how many
+/// or a job, as FieldNews), `alarm` (what happened to an alarm of any loop of the cell, as AlarmHappening), `lost` (how many
 /// records this reader was too slow for).
 ///
 /// With `form=rows`, for pages that watch many loops: `rows` (LiveRows) every `every_ms` (50 to 10,000, else 200), `notices` (what
-/// people should hear of), `hosts` every second, `loops` (where each loop stands) when that changed, `field` (LiveField) when a point was
-/// forced, freed or written by hand, or a job moved. Every event has an id; with
-/// `Last-Event-ID` a reader gets the notices and the traced cycles that it missed. A slow reader gets the newest of each loop.
+/// people should hear of), `alarms` (what happened to alarms, AlarmHappening), `hosts` every second, `loops` (where each loop
+/// stands) when that changed, `field` (LiveField) when a point was forced, freed or written by hand, or a job moved. Every event
+/// has an id; with `Last-Event-ID` a reader gets the notices, the happenings of alarms and the traced cycles that it missed. A
+/// slow reader gets the newest of each loop.
 #[utoipa::path(get, operation_id = "follow_records", path = "/v1/live", tag = "cell", params(LiveQuery),
     responses(
-        (status = 200, description = "Server-sent events: `record` with a Record, `hosts` with Hosts, `field` with FieldNews, `lost` with {\"records\": n}; in rows: `rows`, `notices`, `hosts`, `loops`, `field` with LiveField",
+        (status = 200, description = "Server-sent events: `record` with a Record, `hosts` with Hosts, `field` with FieldNews, `alarm` with AlarmHappening, `lost` with {\"records\": n}; in rows: `rows`, `notices`, `alarms`, `hosts`, `loops`, `field` with LiveField",
             body = Record, content_type = "text/event-stream"),
         (status = "default", description = "What went wrong", body = Problem, content_type = "application/problem+json")))]
 pub(crate) async fn feed(
@@ -117,6 +118,7 @@ pub(crate) async fn feed(
     let feed = Feed {
         records: app.cell.records(),
         news: app.cell.field_events(),
+        alarms: app.cell.alarm_events(),
         stop: app.stop.clone(),
         hosts,
         filter: Filter {
@@ -198,12 +200,13 @@ struct Filter {
 }
 
 impl Filter {
+    /// Is the loop among those that were asked for?
+    fn is_of(&self, id: &LoopId) -> bool {
+        self.loops.as_ref().is_none_or(|loops| loops.contains(id))
+    }
+
     fn passes(&mut self, record: &CoreRecord) -> bool {
-        if self
-            .loops
-            .as_ref()
-            .is_some_and(|loops| !loops.contains(&record.loop_id))
-        {
+        if !self.is_of(&record.loop_id) {
             return false;
         }
         if self.every_ns == 0 {
@@ -226,6 +229,7 @@ struct Feed {
     app: App,
     records: broadcast::Receiver<Arc<CoreRecord>>,
     news: broadcast::Receiver<FieldEvent>,
+    alarms: broadcast::Receiver<Arc<AlarmEvent>>,
     hosts: Interval,
     stop: watch::Receiver<bool>,
     filter: Filter,
@@ -248,6 +252,16 @@ impl Feed {
                     Ok(news) => Event::default().event("field").json_data(FieldNews::from(news)),
                     Err(RecvError::Lagged(lost)) => {
                         Event::default().event("lost").json_data(serde_json::json!({ "records": 0, "field": lost }))
+                    }
+                    Err(RecvError::Closed) => return None,
+                },
+                event = self.alarms.recv() => match event {
+                    Ok(event) if self.filter.is_of(&event.loop_id) => {
+                        Event::default().event("alarm").json_data(AlarmHappening::from(&*event))
+                    }
+                    Ok(_) => continue,
+                    Err(RecvError::Lagged(lost)) => {
+                        Event::default().event("lost").json_data(serde_json::json!({ "records": 0, "alarms": lost }))
                     }
                     Err(RecvError::Closed) => return None,
                 },

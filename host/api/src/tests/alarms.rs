@@ -1,11 +1,14 @@
 //! Alarms over HTTP: what is asked arrives, what is listed can be narrowed, what cannot be is refused in words.
 
+use std::time::Duration;
+
 use axum::http::StatusCode;
 use bumpless_core::{
     Priority,
-    alarms::{Board, Definition, Kind, Sight},
+    alarms::{Board, Change, Definition, Kind, Sight, State, What},
 };
-use bumpless_deploy::alarms::{AlarmAct, AlarmView};
+use bumpless_deploy::alarms::{AlarmAct, AlarmEvent, AlarmView};
+use futures_util::StreamExt as _;
 use serde_json::json;
 
 use super::{
@@ -13,6 +16,7 @@ use super::{
     fake::{host, loop_id},
     get, send,
 };
+use crate::types::AlarmHappening;
 
 /// The alarms of a loop whose measurement is far too high, and is bad in another way.
 pub(super) fn alarms() -> Vec<AlarmView> {
@@ -44,6 +48,95 @@ pub(super) fn alarms() -> Vec<AlarmView> {
             standing: standing.clone(),
         })
         .collect()
+}
+
+fn event(number: u64, at_ns: u64) -> AlarmEvent {
+    AlarmEvent {
+        number,
+        loop_id: loop_id("l"),
+        host: host(),
+        change: Change {
+            at_ns,
+            alarm: "high".to_owned(),
+            what: What::Came,
+            state: State::Active,
+            priority: Priority::High,
+            value: Some(90.0),
+            by: None,
+            note: String::new(),
+            quiet: false,
+            first_out: false,
+        },
+    }
+}
+
+/// What happened at some µs.
+pub(crate) fn happening(at_unix_us: u64) -> AlarmHappening {
+    AlarmHappening::from(&event(at_unix_us, at_unix_us * 1_000))
+}
+
+/// Events of a feed up to and with the first of this name that holds this text.
+async fn until(response: axum::response::Response, name: &str, part: &str) -> String {
+    let mut pieces = response.into_body().into_data_stream();
+    let mut text = String::new();
+    loop {
+        let piece = tokio::time::timeout(Duration::from_secs(20), pieces.next())
+            .await
+            .expect("in time");
+        text.push_str(std::str::from_utf8(&piece.expect("it goes on").expect("readable")).expect("text"));
+        let found = text
+            .split("\n\n")
+            .find(|event| event.contains(&format!("event: {name}")) && event.contains(part) && text.ends_with("\n\n"));
+        if let Some(found) = found {
+            return found.to_owned();
+        }
+    }
+}
+
+#[tokio::test]
+async fn what_happens_to_alarms_is_on_the_feed_and_comes_again_to_a_reader_that_comes_back() {
+    let bench = Bench::new();
+    let response = bench.ask(get("/v1/live")).await;
+    bench
+        .cell
+        .alarm_news
+        .send(std::sync::Arc::new(event(7, 9_000)))
+        .expect("the feed listens");
+    let told = until(response, "alarm", "h-7").await;
+    assert!(
+        told.contains("\"what\":\"came\"") && told.contains("\"at_unix_us\":9"),
+        "{told}"
+    );
+
+    let app = bench.app.clone();
+    app.happenings.take(happening(1));
+    let response = bench.ask(get("/v1/live?form=rows&every_ms=50")).await;
+    app.happenings.take(happening(2));
+    let told = until(response, "alarms", "h-2").await;
+    assert!(
+        !told.contains("h-1\""),
+        "what came before the feed is in the list: {told}"
+    );
+    let id = told
+        .lines()
+        .find_map(|line| line.strip_prefix("id: "))
+        .expect("an id")
+        .to_owned();
+    app.happenings.take(happening(3));
+    let response = bench
+        .ask(get(&format!("/v1/live?form=rows&every_ms=50&after={id}")))
+        .await;
+    let told = until(response, "alarms", "h-3").await;
+    assert!(!told.contains("h-2\""), "{told}");
+    // A reader of another process goes on by time.
+    let response = bench.ask(get("/v1/live?form=rows&every_ms=50&after=1-0-1-9")).await;
+    let told = until(response, "alarms", "h-3").await;
+    assert!(told.contains("h-2\"") && !told.contains("h-1\""), "{told}");
+    let response = bench
+        .ask(get("/v1/live?form=rows&every_ms=50&loops=m&after=1-0-0-0"))
+        .await;
+    let told = until(response, "hosts", "").await;
+    assert!(!told.contains("h-3"), "{told}");
 }
 
 #[tokio::test]

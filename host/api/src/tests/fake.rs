@@ -58,6 +58,8 @@ pub(crate) struct Fake {
     pub(crate) alarm_acts: Mutex<Vec<(String, AlarmAct, String)>>,
     pub(crate) jobs: Mutex<Vec<bumpless_deploy::commissioning::JobDraft>>,
     pub(crate) news: broadcast::Sender<bumpless_deploy::commissioning::FieldEvent>,
+    pub(crate) alarm_news: broadcast::Sender<Arc<AlarmEvent>>,
+    pub(crate) trail: Mutex<super::audit::Trail>,
     records: broadcast::Sender<Arc<Record>>,
 }
 
@@ -84,6 +86,8 @@ impl Fake {
             alarm_acts: Mutex::default(),
             jobs: Mutex::default(),
             news: broadcast::channel(FEED_CAPACITY).0,
+            alarm_news: broadcast::channel(FEED_CAPACITY).0,
+            trail: Mutex::default(),
             records: broadcast::channel(FEED_CAPACITY).0,
         }
     }

@@ -143,7 +143,7 @@ async fn a_feed_in_rows_begins_with_all_loops_and_tells_the_newest_of_each() {
 async fn a_reader_goes_on_where_it_stopped() {
     let bench = Bench::new();
     // The fake's log has the cycles 1 to 3 of any loop.
-    let response = bench.ask(get("/v1/live?form=rows&trace=l&after=1-0-4")).await;
+    let response = bench.ask(get("/v1/live?form=rows&trace=l&after=1-0-4-0")).await;
     let mut events = response.into_body().into_data_stream();
     let (id, rows) = named(&mut events, "rows").await;
     let traced: Vec<u64> = rows["trace"]
@@ -153,7 +153,7 @@ async fn a_reader_goes_on_where_it_stopped() {
         .filter_map(|row| row["seq"].as_u64())
         .collect();
     assert_eq!(traced, [1, 2, 3]);
-    assert_eq!(id.split('-').count(), 3, "{id}");
+    assert_eq!(id.split('-').count(), 4, "{id}");
     for (query, part) in [
         ("form=rows&after=x", "no id of an event"),
         ("form=rows&trace=A", "'A'"),

@@ -35,6 +35,10 @@ pub enum AlarmKind {
     Dissent,
     /// Raised by the controller itself.
     Controller,
+    /// A host's clock is off.
+    Clock,
+    /// A host's disk is nearly full, or refuses what it is given.
+    Disk,
 }
 
 /// Where an alarm is in its life.
@@ -81,7 +85,9 @@ both_ways!(
     Overrun,
     RedundancyLost,
     Dissent,
-    Controller
+    Controller,
+    Clock,
+    Disk
 );
 both_ways!(AlarmState, core::State, Normal, Active, Acknowledged, Returned, Latched);
 
@@ -313,6 +319,10 @@ impl LoopAlarms {
 /// What happened to an alarm.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct AlarmHappening {
+    /// Names this happening in the cell, whichever host tells of it.
+    pub id: String,
+    /// The home of the loop.
+    pub host: String,
     /// When, in µs since 1970 by the home's clock.
     pub at_unix_us: u64,
     /// The loop.
@@ -357,6 +367,8 @@ impl From<&AlarmEvent> for AlarmHappening {
             What::Removed => "removed",
         };
         Self {
+            id: format!("{}-{}", event.host, event.number),
+            host: event.host.to_string(),
             at_unix_us: change.at_ns / 1_000,
             loop_name: event.loop_id.to_string(),
             alarm: change.alarm.clone(),

@@ -27,6 +27,15 @@ pub(crate) enum AlarmCommand {
         #[arg(long, default_value_t = 50)]
         limit: u32,
     },
+    /// Follow what happens to alarms, as it happens.
+    Watch {
+        /// Only those of this loop.
+        #[arg(long = "loop", value_name = "LOOP")]
+        loop_name: Option<String>,
+        /// Stop after so many happenings.
+        #[arg(long, value_name = "N")]
+        count: Option<u64>,
+    },
     /// Acknowledge: a person has seen it.
     Ack {
         #[command(flatten)]

@@ -12,7 +12,7 @@ use crate::{
     cli::{AlarmCommand, AlarmOf},
     client::{Answer, Client, encoded},
     error::Error,
-    show,
+    show, watch,
 };
 
 /// Alarms in one file; a loop has at most 64.
@@ -51,6 +51,7 @@ pub(crate) fn run(client: &Client, json: bool, what: AlarmCommand) -> Result<(),
             }
             history(&answer.decode()?)
         }
+        AlarmCommand::Watch { loop_name, count } => watch::alarms(client, json, loop_name.as_deref(), count),
         AlarmCommand::Ack { of, note } => act(&of, AlarmActWord::Acknowledge, &note, "", 0.0),
         AlarmCommand::Reset { of } => act(&of, AlarmActWord::Reset, "", "", 0.0),
         AlarmCommand::Shelve { of, seconds, reason } => act(&of, AlarmActWord::Shelve, "", &reason, seconds),

@@ -2,7 +2,10 @@
 //!
 //! Never: reads the file; `config` does.
 
+use std::path::Path;
+
 use bumpless_core::{HostId, limits::HOST_LABELS_MAX};
+use bumpless_deploy::{HostAlarms, webhook::WebhookConfig};
 
 use crate::error::Error;
 
@@ -27,4 +30,42 @@ pub(super) fn check(
         return Err(wrong("clock_offset_s", reason));
     }
     Ok(())
+}
+
+/// From when on the host's own clock and disk are alarms, within bounds.
+pub(super) fn alarms(table: HostAlarms, wrong: &dyn Fn(&str, String) -> Error) -> Result<HostAlarms, Error> {
+    let HostAlarms {
+        clock_offset_max_ms: clock,
+        disk_free_min_mib: disk,
+    } = table;
+    super::in_range(wrong, "alarms.clock_offset_max_ms", Some(clock), 0, 10, 3_600_000)?;
+    super::in_range(wrong, "alarms.disk_free_min_mib", Some(disk), 0, 1, 1_048_576)?;
+    Ok(table)
+}
+
+/// Who is told of alarms: each by a name of its own.
+pub(super) fn webhooks(
+    mut tables: Vec<WebhookConfig>,
+    folder: &Path,
+    wrong: &dyn Fn(&str, String) -> Error,
+) -> Result<Vec<WebhookConfig>, Error> {
+    let most = bumpless_deploy::limits::WEBHOOKS_MAX;
+    if tables.len() > most {
+        return Err(wrong(
+            "webhook",
+            format!("there are {} of them; at most {most} are possible", tables.len()),
+        ));
+    }
+    let mut names = std::collections::HashSet::new();
+    for table in &mut tables {
+        table.resolve(folder);
+        table.check().map_err(|error| wrong("webhook", error.to_string()))?;
+        if !names.insert(table.name.clone()) {
+            return Err(wrong(
+                "webhook.name",
+                format!("two are named {:?}; give each its own name", table.name),
+            ));
+        }
+    }
+    Ok(tables)
 }

@@ -13,7 +13,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use bumpless_api::types::{Hosts, Record};
+use bumpless_api::types::{AlarmHappening, Hosts, Record};
 use serde::Deserialize;
 
 use crate::{
@@ -39,6 +39,8 @@ pub(crate) enum News {
     Record(Box<Record>, String),
     /// The hosts, every second.
     Hosts(Hosts),
+    /// Something happened to an alarm.
+    Alarm(Box<AlarmHappening>, String),
     /// Records that this reader was too slow for.
     Lost(u64),
     /// The feed now comes from this API.
@@ -57,9 +59,18 @@ pub(crate) struct Feed {
 impl Feed {
     /// Starts reading what concerns one loop.
     pub(crate) fn start(client: &Client, name: &str) -> Result<Self, Error> {
+        Self::open(client, format!("/v1/live?loops={}", encoded(name)))
+    }
+
+    /// Starts reading for what happens to alarms, of one loop where one is named. Records come thinned out as far as they can be.
+    pub(crate) fn of_alarms(client: &Client, name: Option<&str>) -> Result<Self, Error> {
+        let of = name.map(|name| format!("&loops={}", encoded(name))).unwrap_or_default();
+        Self::open(client, format!("/v1/live?every_ms={}{of}", u32::MAX))
+    }
+
+    fn open(client: &Client, path: String) -> Result<Self, Error> {
         let first = client.api().to_owned();
         let (sender, news) = sync_channel(QUEUE_MAX);
-        let path = format!("/v1/live?loops={}", encoded(name));
         std::thread::Builder::new()
             .name("feed".to_owned())
             .spawn(move || follow(first, &path, &sender))
@@ -206,6 +217,11 @@ impl Event {
                     .map_err(wrong),
             ),
             "hosts" => Some(serde_json::from_str(&data).map(News::Hosts).map_err(wrong)),
+            "alarm" => Some(
+                serde_json::from_str(&data)
+                    .map(|event| News::Alarm(Box::new(event), data.clone()))
+                    .map_err(wrong),
+            ),
             "lost" => Some(
                 serde_json::from_str(&data)
                     .map(|lost: Lost| News::Lost(lost.records))

@@ -30,6 +30,7 @@ pub(super) fn run(feed: &Feed, mut story: Story, json: bool, cycles: Option<u64>
                 story.record(*record);
             }
             News::Hosts(hosts) => story.hosts(hosts),
+            News::Alarm(event, _) => story.alarm(&event),
             News::Lost(records) => {
                 story.lost(records);
                 show::note(&format!("{records} records were lost: this reader is too slow"));

@@ -66,6 +66,7 @@ fn take(story: &mut Story, news: News) {
     match news {
         News::Record(record, _) => story.record(*record),
         News::Hosts(hosts) => story.hosts(hosts),
+        News::Alarm(event, _) => story.alarm(&event),
         News::Lost(records) => story.lost(records),
         News::Connected(api) => story.connected(api),
         News::Disconnected(reason) | News::Gone(reason) => story.disconnected(&reason),

@@ -4,7 +4,7 @@
 
 use std::collections::{BTreeMap, VecDeque};
 
-use bumpless_api::types::{Event, Host, Hosts, Loop, Mode, Record};
+use bumpless_api::types::{AlarmHappening, Event, Host, Hosts, Loop, Mode, Record};
 use bumpless_core::indices::{Indices, Rule, TotalVariation};
 
 use crate::{error::Error, show};
@@ -194,6 +194,15 @@ impl Story {
             self.now(&format!("the feed comes from {api}"));
         }
         self.api = api;
+    }
+
+    /// Something happened to an alarm of the loop.
+    pub(super) fn alarm(&mut self, event: &AlarmHappening) {
+        let mut text = format!("alarm {}: {}", event.alarm, event.what);
+        if let Some(by) = event.by.as_deref().filter(|by| !by.is_empty()) {
+            text.push_str(&format!(" by {by}"));
+        }
+        self.now(&text);
     }
 
     /// The feed ended; another host is tried.

@@ -245,6 +245,7 @@ pub(crate) fn vitals(host: &HostId) -> Vitals {
         loops_held: 55,
         draining: true,
         drain_kept: false,
+        unix_ms: 0,
         labels: vec![],
         version: "0.1.0".to_owned(),
     }

@@ -196,6 +196,27 @@ impl Board {
         }
     }
 
+    /// The board of a host, which is no loop: its clock, and its disk.
+    #[must_use]
+    pub fn of_host() -> Self {
+        let alarms = [
+            ("clock", Kind::Clock, Priority::Medium),
+            ("disk", Kind::Disk, Priority::High),
+        ];
+        let one = |(name, kind, priority)| {
+            let definition = Definition {
+                off_delay_s: SETTLED_S,
+                ..Definition::new(name, kind, priority)
+            };
+            (name.to_owned(), Standing::new(definition))
+        };
+        Self {
+            alarms: alarms.into_iter().map(one).collect(),
+            controllers: BTreeMap::new(),
+            recent_ns: VecDeque::new(),
+        }
+    }
+
     /// All alarms, by name.
     pub fn all(&self) -> impl Iterator<Item = &Standing> {
         self.alarms.values()

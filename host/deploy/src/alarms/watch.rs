@@ -35,6 +35,7 @@ struct Ports {
 impl Room {
     /// Reads the boards from the disk. Blocks.
     pub(crate) fn read_alarms(&self) -> Result<(), crate::error::Error> {
+        self.alarms.number_on(self.store.last_alarm_change()?);
         let rows = self.store.alarm_boards::<Board>()?;
         let mut boards = self.alarms.boards.lock();
         for (name, board) in rows {
@@ -131,16 +132,15 @@ impl Room {
             so: &so,
             raised: &record.alarms,
         });
-        events.extend(changes.into_iter().map(|change| AlarmEvent {
-            loop_id: record.loop_id.clone(),
-            host: self.here.clone(),
-            change,
-        }));
+        let happened = |change| self.happened(&record.loop_id, change);
+        events.extend(changes.into_iter().map(happened));
     }
 
     /// Boards of deleted loops go, and what the disk refused before is tried again.
     async fn sweep_alarms(&self, ports: &mut HashMap<LoopId, Ports>) {
-        let at_home = |id: &LoopId| self.book.get(id).is_some_and(|intent| intent.home == self.here);
+        let own = self.own_board();
+        let at_home =
+            |id: &LoopId| own.as_ref() == Some(id) || self.book.get(id).is_some_and(|intent| intent.home == self.here);
         let gone: Vec<LoopId> = {
             let mut boards = self.alarms.boards.lock();
             let gone = boards.keys().filter(|id| !at_home(id)).cloned().collect::<Vec<_>>();

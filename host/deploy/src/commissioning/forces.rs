@@ -18,12 +18,14 @@ use bumpless_io::{Force, IoServer, PointIndex};
 use bumpless_store::Store;
 use parking_lot::Mutex;
 use serde::{Deserialize, Serialize};
+use serde_json::json;
 
 use super::{
     FieldEvent,
     marks::{Mark, Marks, Position},
 };
 use crate::{
+    audit::{Act, AuditKind, Seen},
     book::on_disk,
     error::{Error, chain},
     limits::{FORCES_LOOK, WORDS_CHARS_MAX},
@@ -243,6 +245,7 @@ impl Room {
         // Off the disk first: what a person was told to be free must not come back with a restart. Of two masters both
         // remember the end for as long as the force would have lasted.
         let ended = self.commissioning.forces.marks.lock().get(point).cloned();
+        let ended_force = ended.as_ref().and_then(|mark| mark.force.clone());
         let mark = match (io.redundant(index), ended) {
             (Some(_), Some(ended)) if by_time => Some(ended.over()),
             (Some(_), Some(ended)) => Some(self.mark_now(io, index, point, ended.over().until_unix_ms, None)),
@@ -264,6 +267,12 @@ impl Room {
         if by_time && !io.speaks_for(index) {
             // The master tells.
             return Ok(());
+        }
+        if by_time {
+            // Nobody asked for it, so nobody else writes it down.
+            let seen = Seen::of(json!({ "force": ended_force }), json!({ "force": null }));
+            let act = Act::new(AuditKind::PointUnforce, point.as_str(), json!({ "because": by }));
+            self.audit_own(act, seen, None).await;
         }
         self.share_forces().await;
         self.tell_field(FieldEvent::Unforced {

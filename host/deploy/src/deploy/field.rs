@@ -4,14 +4,27 @@
 
 use bumpless_cell::Knock;
 use bumpless_core::PointId;
+use serde_json::{Value, json};
 use tokio::sync::broadcast;
 
 use super::Deploy;
 use crate::{
+    audit::{Act, AuditKind, Seen, shown},
     commissioning::{BusView, FieldEvent, ForceDraft, JobDraft, JobView},
     error::{Error, chain},
     view::PointView,
 };
+
+/// What entries tell of a point.
+fn held(point: &PointView) -> Value {
+    json!({ "value": point.value, "force": point.force })
+}
+
+/// What entries tell of a job.
+fn job(end: &Result<JobView, Error>) -> Seen {
+    end.as_ref()
+        .map_or_else(|_| Seen::default(), |job| Seen::named(&job.id))
+}
 
 impl Deploy {
     /// Opens a door of this host on the bus, for programs that are no hosts. `answers` must not block.
@@ -32,6 +45,27 @@ impl Deploy {
         }
     }
 
+    /// Does something to a point, with its entry.
+    async fn on_point(
+        &self,
+        act: Act,
+        point: &PointId,
+        work: impl Future<Output = Result<PointView, Error>> + Send + 'static,
+    ) -> Result<PointView, Error> {
+        let (room, point) = (self.room.clone(), point.clone());
+        let work = async move {
+            // Where it cannot be seen, the entry goes without it, and the work says why.
+            let before = room.point(&point).await.ok();
+            let end = work.await;
+            let seen = match &end {
+                Ok(after) => Seen::of(before.as_ref().map(held).unwrap_or_default(), held(after)),
+                Err(_) => Seen::default(),
+            };
+            (end, seen)
+        };
+        self.room.audited(act, work).await
+    }
+
     /// One point, as its I/O host sees it.
     ///
     /// # Errors
@@ -46,7 +80,10 @@ impl Deploy {
     /// [`Error::NotFound`], [`Error::Invalid`] for a value that the point does not take, [`Error::Refused`] by a loop or a
     /// force, [`Error::Unreachable`], [`Error::Timeout`].
     pub async fn write_point(&self, point: &PointId, value: f64, by: String) -> Result<PointView, Error> {
-        self.room.write_point(point, value, by).await
+        let act = Act::new(AuditKind::PointWrite, point.as_str(), json!({ "value": value })).by(&by);
+        let (room, id) = (self.room.clone(), point.clone());
+        self.on_point(act, point, async move { room.write_point(&id, value, by).await })
+            .await
     }
 
     /// Holds a point at a value for a time, over takeovers of its loop and restarts of its host.
@@ -54,7 +91,10 @@ impl Deploy {
     /// # Errors
     /// As [`Deploy::write_point`], [`Error::Store`].
     pub async fn force(&self, point: &PointId, draft: ForceDraft) -> Result<PointView, Error> {
-        self.room.force(point, draft).await
+        let act = Act::new(AuditKind::PointForce, point.as_str(), shown(&draft)).by(&draft.by);
+        let (room, id) = (self.room.clone(), point.clone());
+        self.on_point(act, point, async move { room.force(&id, draft).await })
+            .await
     }
 
     /// Lets a point go before its time.
@@ -62,7 +102,10 @@ impl Deploy {
     /// # Errors
     /// [`Error::Refused`] where it is not forced, else as [`Deploy::point`].
     pub async fn unforce(&self, point: &PointId, by: String) -> Result<PointView, Error> {
-        self.room.unforce(point, by).await
+        let act = Act::new(AuditKind::PointUnforce, point.as_str(), Value::Null).by(&by);
+        let (room, id) = (self.room.clone(), point.clone());
+        self.on_point(act, point, async move { room.unforce(&id, by).await })
+            .await
     }
 
     /// The buses of all hosts, by name.
@@ -80,7 +123,14 @@ impl Deploy {
     /// [`Error::Busy`] where too many wait, [`Error::Refused`] in the way of a loop, [`Error::NotFound`],
     /// [`Error::Invalid`], [`Error::Unreachable`], [`Error::Timeout`].
     pub async fn start_job(&self, draft: JobDraft) -> Result<JobView, Error> {
-        self.room.start_job(draft).await
+        let act = Act::new(AuditKind::JobStart, "", shown(&draft)).by(&draft.by);
+        let room = self.room.clone();
+        let work = async move {
+            let end = room.start_job(draft).await;
+            let seen = job(&end);
+            (end, seen)
+        };
+        self.room.audited(act, work).await
     }
 
     /// The jobs of all hosts, oldest first, without their results.
@@ -101,7 +151,14 @@ impl Deploy {
     /// # Errors
     /// [`Error::Refused`] where it has ended, else as [`Deploy::job`].
     pub async fn cancel_job(&self, id: &str, by: String) -> Result<JobView, Error> {
-        self.room.cancel_job(id, by).await
+        let act = Act::new(AuditKind::JobCancel, id, Value::Null).by(&by);
+        let (room, id) = (self.room.clone(), id.to_owned());
+        let work = async move {
+            let end = room.cancel_job(&id, by).await;
+            let seen = job(&end);
+            (end, seen)
+        };
+        self.room.audited(act, work).await
     }
 
     /// What happens to points and jobs. A receiver that lags loses the oldest.

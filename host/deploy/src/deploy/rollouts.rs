@@ -4,14 +4,22 @@
 
 use bumpless_core::HostId;
 use futures_util::future::join_all;
+use serde_json::{Value, json};
 
 use super::{Deploy, unexpected};
 use crate::{
+    audit::{Act, AuditKind, Seen},
     error::Error,
     limits::{ANSWER_WAIT, STAGE_WAIT},
     rollout::{RolloutDraft, RolloutList, RolloutView, place_of},
     wire::{Ask, RolloutAsk, Told},
 };
+
+/// What entries tell of a rollout.
+fn named(end: &Result<RolloutView, Error>) -> Seen {
+    end.as_ref()
+        .map_or_else(|_| Seen::default(), |rollout| Seen::named(&rollout.id))
+}
 
 impl Deploy {
     /// Begins a rollout at this host, which keeps it and goes on with it after a restart. Returns at once.
@@ -21,7 +29,22 @@ impl Deploy {
     /// loop, [`Error::Refused`] for a loop of another rollout under way here, [`Error::Busy`] for too many of these,
     /// [`Error::Store`]. Then nothing was begun.
     pub async fn start_rollout(&self, draft: RolloutDraft) -> Result<RolloutView, Error> {
-        self.room.start_rollout(draft).await
+        let asked = json!({
+            "component": draft.component,
+            "parameters": draft.parameters,
+            "loops": draft.loops,
+            "all_of": draft.all_of,
+            "rule": draft.rule,
+        });
+        let room = self.room.clone();
+        let work = async move {
+            let end = room.start_rollout(draft).await;
+            let seen = named(&end);
+            (end, seen)
+        };
+        self.room
+            .audited(Act::new(AuditKind::RolloutStart, "", asked), work)
+            .await
     }
 
     /// The rollouts that the hosts of the cell keep. Every host is asked, and given two seconds.
@@ -70,7 +93,16 @@ impl Deploy {
     /// # Errors
     /// As [`Deploy::rollout`]; [`Error::Store`] where the stop is not on disk: it stands all the same until the host stops.
     pub async fn stop_rollout(&self, id: &str) -> Result<RolloutView, Error> {
-        let (host, number) = place_of(id)?;
-        self.of_rollout(&host, RolloutAsk::Stop(number)).await
+        let (deploy, id) = (self.clone(), id.to_owned());
+        let act = Act::new(AuditKind::RolloutStop, &id, Value::Null);
+        let work = async move {
+            let end = match place_of(&id) {
+                Ok((host, number)) => deploy.of_rollout(&host, RolloutAsk::Stop(number)).await,
+                Err(error) => Err(error),
+            };
+            let seen = named(&end);
+            (end, seen)
+        };
+        self.room.audited(act, work).await
     }
 }

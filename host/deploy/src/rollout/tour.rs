@@ -19,6 +19,7 @@ use std::{
 
 use bumpless_core::{Digest, LoopId, Record};
 use futures_util::{StreamExt as _, stream::FuturesUnordered};
+use serde_json::{Value, json};
 use tokio::sync::broadcast;
 
 use super::{
@@ -29,6 +30,7 @@ use super::{
     watch::Sight,
 };
 use crate::{
+    audit::{Act, Asker, AuditKind, Via},
     error::Error,
     expect::Expect,
     limits::{ANSWER_WAIT, APPLY_WAIT, ROLLOUT_ASK_FOR, ROLLOUT_ASK_PAUSE, ROLLOUT_LOOK_EVERY, ROLLOUT_WATCH_SLACK},
@@ -179,11 +181,21 @@ impl Tour {
             to: leg.before,
         };
         let digest = head.digest;
+        let name = format!("{}.{}", self.room.here, self.rollout.number);
         Box::pin(async move {
+            let asked = |amend: &Amend| match amend {
+                Amend::Return { from, to } => json!({ "rollout": name, "from_revision": from, "to_revision": to }),
+                _ => json!({ "rollout": name, "component": digest.to_string() }),
+            };
             let end = match action {
-                Action::Change(_) => End::Changed(amended(&room, &id, &Amend::Roll(roll)).await),
+                Action::Change(_) => {
+                    let amend = Amend::Roll(roll);
+                    End::Changed(noted(&room, &id, asked(&amend), amended(&room, &id, &amend).await).await)
+                }
                 Action::Find(_) => End::Found(found(&room, &id, &roll, digest).await),
-                Action::Back(_) => End::WentBack(amended(&room, &id, &back).await),
+                Action::Back(_) => {
+                    End::WentBack(noted(&room, &id, asked(&back), amended(&room, &id, &back).await).await)
+                }
             };
             (number, end)
         })
@@ -361,6 +373,18 @@ async fn amended(room: &Arc<Room>, id: &LoopId, amend: &Amend) -> Result<ApplyEn
             Err(error) => return Err(error),
         }
     }
+}
+
+/// Writes a change, or its refusal, down, and passes it on.
+async fn noted(room: &Arc<Room>, id: &LoopId, asked: Value, end: Result<ApplyEnd, Error>) -> Result<ApplyEnd, Error> {
+    let asker = Asker {
+        via: Via::Rollout,
+        ..Asker::default()
+    };
+    let seen = room.revised(&end).await;
+    let act = Act::on_loop(AuditKind::LoopRolled, id, asked);
+    asker.asks(room.audit_own(act, seen, end.as_ref().err())).await;
+    end
 }
 
 /// Finds out whether a change was made before this host restarted. Gives the revision that it brought.

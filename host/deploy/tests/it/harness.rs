@@ -154,6 +154,9 @@ impl Cell {
             labels: vec![],
             api: None,
             version: "test".to_owned(),
+            audit_bytes_max: 64 * 1024 * 1024,
+            webhooks: vec![],
+            host_alarms: bumpless_deploy::HostAlarms::default(),
         })
         .expect("deployment starts");
         *field.deploy.lock() = Some(started.clone());

@@ -113,6 +113,9 @@ pub(crate) async fn host(cell: &Cell, dir: &std::path::Path) -> Real {
         api: None,
         labels: vec![],
         version: "test".to_owned(),
+        audit_bytes_max: 64 * 1024 * 1024,
+        webhooks: vec![],
+        host_alarms: bumpless_deploy::HostAlarms::default(),
     })
     .unwrap();
     *slot.lock() = Some(deploy.clone());

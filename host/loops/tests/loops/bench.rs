@@ -312,6 +312,7 @@ impl Bench {
                     loops_held: 1,
                     draining: false,
                     drain_kept: false,
+                    unix_ms: 0,
                     labels: vec![],
                     version: String::new(),
                 });

@@ -25,6 +25,7 @@ struct Memory {
     age: Mutex<Duration>,
     commands: Mutex<Vec<(LoopId, CommandBody)>>,
     writes: Mutex<Vec<(PointId, f64, String)>>,
+    refused: Mutex<Vec<(String, String)>>,
     refusal: Mutex<Option<Error>>,
 }
 
@@ -80,15 +81,20 @@ impl Plant for Memory {
         Box::pin(std::future::ready(answer))
     }
 
-    fn command(&self, id: LoopId, body: CommandBody) -> Later<Result<(), Error>> {
+    fn command(&self, id: LoopId, body: CommandBody, _client: String) -> Later<Result<(), Error>> {
         self.commands.lock().push((id, body));
         let end = self.refusal.lock().clone().map_or(Ok(()), Err);
         Box::pin(std::future::ready(end))
     }
 
-    fn write_point(&self, point: PointId, value: f64, by: String) -> Later<Result<(), Error>> {
-        self.writes.lock().push((point, value, by));
+    fn write_point(&self, point: PointId, value: f64, client: String) -> Later<Result<(), Error>> {
+        self.writes.lock().push((point, value, client));
         Box::pin(std::future::ready(Ok(())))
+    }
+
+    fn refused(&self, _server: String, asked: String, reason: String, _client: String) -> Later<()> {
+        self.refused.lock().push((asked, reason));
+        Box::pin(std::future::ready(()))
     }
 }
 
@@ -164,6 +170,7 @@ impl Bench {
             age: Mutex::new(Duration::from_millis(20)),
             commands: Mutex::default(),
             writes: Mutex::default(),
+            refused: Mutex::default(),
             refusal: Mutex::default(),
         });
         let identity = Identity::new(["maker", "code", "1", "", "", "", ""]);
@@ -232,7 +239,7 @@ fn loops_are_read_and_commanded() {
         ]
     );
     assert_eq!(bench.ask(&[6, 0, 3, 0, 33]), [6, 0, 3, 0, 33]);
-    let by = "Modbus client 192.0.2.9:4711".to_owned();
+    let by = "192.0.2.9:4711".to_owned();
     assert_eq!(*bench.plant.writes.lock(), [(PointId::new("here").unwrap(), 33.0, by)]);
     // Silence of the loop is not its last setpoint.
     *bench.plant.age.lock() = Duration::from_secs(60);
@@ -254,8 +261,14 @@ fn refusals_of_the_cell_become_exceptions() {
         *bench.plant.refusal.lock() = Some(error);
         assert_eq!(bench.ask(&[6, 0, 0, 0, 5]), [0x86, code]);
     }
+    assert!(
+        bench.plant.refused.lock().is_empty(),
+        "the cell writes down what it refuses itself"
+    );
     // What is refused before the cell is asked does nothing of a longer write.
     bench.plant.commands.lock().clear();
     assert_eq!(bench.ask(&[16, 0, 0, 0, 2, 4, 0, 5, 0, 9]), [0x90, 3]);
     assert!(bench.plant.commands.lock().is_empty());
+    let refused = bench.plant.refused.lock();
+    assert!(refused.len() == 1 && refused[0].0.contains("Registers"), "{refused:?}");
 }

@@ -4,7 +4,8 @@
 //! Last-Event-ID or after= ─► making up: notices and traced cycles since then
 //!      └ none ─► the newest of every loop
 //! beat (every_ms) ─► all records that passed meanwhile ─► newest of each loop, every one of the traced ─► one event `rows`
-//!                 └► notices since the last one ─► `notices`; each second `hosts`; when it changed `loops`; points and jobs: `field`
+//!                 └► notices since the last one ─► `notices`; of alarms ─► `alarms`; each second `hosts`; when it changed
+//!                    `loops`; points and jobs: `field`
 //! ```
 //! A reader that is slow is not polled, so nothing piles up for it but the bounded channel of records; what it lost is made good
 //! by the newest record of each loop, and counted. Never: touches a cycle, or wakes for each record.
@@ -30,31 +31,34 @@ use tokio::{
 use crate::{
     limits::{CATCH_UP_TIME_MAX, FIELD_NEWS_AT_ONCE, HOSTS_EVERY, NOTICES_AT_ONCE, STANDING_EVERY, TRACE_ROWS_MAX},
     server::App,
-    types::{Hosts, LiveField, LiveRow, LiveRows, Standing},
+    types::{AlarmHappening, Hosts, LiveField, LiveRow, LiveRows, Standing},
 };
 
-/// Where a reader stopped: the process that it read from, the last notice, the newest cycle, as `boot-number-time`.
+/// Where a reader stopped: the process that it read from, the last notice, the newest cycle, the last happening of an alarm, as
+/// `boot-number-time-alarm`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Mark {
     boot: u64,
     number: u64,
     at_unix_us: u64,
+    alarm: u64,
 }
 
 impl Mark {
     /// From an event's id; none where the text is no id of ours.
     pub(super) fn parse(text: &str) -> Option<Self> {
         let mut parts = text.split('-').map(|part| part.parse().ok());
-        let (boot, number, at_unix_us) = (parts.next()??, parts.next()??, parts.next()??);
+        let (boot, number, at_unix_us, alarm) = (parts.next()??, parts.next()??, parts.next()??, parts.next()??);
         parts.next().is_none().then_some(Self {
             boot,
             number,
             at_unix_us,
+            alarm,
         })
     }
 
     fn id(self) -> String {
-        format!("{}-{}-{}", self.boot, self.number, self.at_unix_us)
+        format!("{}-{}-{}-{}", self.boot, self.number, self.at_unix_us, self.alarm)
     }
 }
 
@@ -110,6 +114,7 @@ impl Rows {
                 boot,
                 number: app.notices.number(),
                 at_unix_us: 0,
+                alarm: app.happenings.number(),
             },
             hosts_at: None,
             standing: None,
@@ -169,6 +174,11 @@ impl Rows {
             later
                 .first()
                 .map_or(self.mark.number, |first| first.number.saturating_sub(1))
+        };
+        self.mark.alarm = if after.boot == self.mark.boot {
+            after.alarm
+        } else {
+            self.app.happenings.number_at(after.at_unix_us)
         };
         self.mark.at_unix_us = after.at_unix_us;
         let from_ns = after.at_unix_us.saturating_mul(1_000).saturating_add(1_000);
@@ -259,6 +269,16 @@ impl Rows {
             }
         }
         self.say_field();
+        let (happened, last) = self.app.happenings.since(self.mark.alarm);
+        self.mark.alarm = last;
+        let of_ours = |event: &Arc<AlarmHappening>| {
+            let named = LoopId::new(&event.loop_name);
+            self.loops.is_none() || named.is_ok_and(|id| self.wants(&id))
+        };
+        let wanted: Vec<_> = happened.iter().filter(|event| of_ours(event)).collect();
+        if !wanted.is_empty() {
+            self.push("alarms", Event::default().json_data(wanted));
+        }
         if self.hosts_at.is_none_or(|at| at.elapsed() >= HOSTS_EVERY) {
             self.hosts_at = Some(Instant::now());
             let standing = standing(&self.app);
@@ -338,17 +358,19 @@ mod tests {
             boot: 7,
             number: 8,
             at_unix_us: 9,
+            alarm: 10,
         };
         assert_eq!(Mark::parse(&mark.id()), Some(mark));
         for bad in [
             "",
             "1",
             "1-2",
-            "1-2-3-4",
-            "a-2-3",
-            "1--3",
-            "-1-2-3",
-            "1-2-99999999999999999999999",
+            "1-2-3",
+            "1-2-3-4-5",
+            "a-2-3-4",
+            "1--3-4",
+            "-1-2-3-4",
+            "1-2-99999999999999999999999-4",
         ] {
             assert_eq!(Mark::parse(bad), None, "{bad}");
         }
