@@ -12,6 +12,7 @@
 //! | drain | hosts that are emptied, restarted one by one, preferred, cut off |
 //! | chaos | faults by a seed, under the checker |
 //! | history | replays, backtests, shadows |
+//! | past | the long history: gaps filled by other hosts, kills, points, files |
 //! | rollouts | one component for many loops, one loop first |
 //! | calls | the cell as a control service |
 //! | refusals | bad components, loops, requests, configurations, command lines |
@@ -50,6 +51,7 @@ mod masters;
 mod members;
 mod modbus;
 mod neighbours;
+mod past;
 mod phases;
 mod refusals;
 mod restarts;

@@ -19,6 +19,7 @@ pub mod types;
 
 mod cell;
 mod error;
+mod export;
 mod extract;
 mod field;
 mod gate;

@@ -14,6 +14,7 @@ mod hosts;
 mod library;
 mod live;
 mod loops;
+mod past;
 mod record;
 mod rollouts;
 mod words;
@@ -40,12 +41,14 @@ pub use loops::{
     Apply, Command, Failure, HandOver, Loop, LoopDraft, Loops, ModeRequest, MoveRequest, OutputLimit, OutputRequest,
     Policy, RollbackRequest, SetRequest, SetpointRequest, SwapRequest, Tally,
 };
+pub use past::{History, HistoryPart, HistoryStretch, HistoryValues};
 pub use record::{Alarm, Applied, Aside, Event, LogLine, Message, Reading, Record, Redundancy, Vote};
 pub use rollouts::{OnFailure, Rollout, RolloutLoop, RolloutRequest, RolloutStage, RolloutState, Rollouts, SilentHost};
 pub use words::{Direction, LogLevel, Mode, OnBump, OnFault, OnFewer, PortKind, Priority, Quality, Strategy};
 
 pub(crate) use history::window;
 pub(crate) use loops::Depth;
+pub(crate) use past::{output, output_names};
 pub(crate) use record::{PortTable, PortTables};
 
 use base64::{Engine as _, engine::general_purpose::STANDARD};

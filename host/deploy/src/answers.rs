@@ -74,6 +74,7 @@ impl Room {
                 }
                 Ask::Shadow(id, ask) => self.shadow_here(&from, id, ask).await,
                 Ask::Alarm(ask) => self.alarms_here(ask).await,
+                Ask::History(ask) => self.history_here(*ask).await.map(Box::new).map(Told::History),
                 Ask::Rollout(ask) => self.rollout_here(ask).await,
                 Ask::Field(ask) => self.field_here(*ask).await.map(Box::new).map(Told::Field),
                 Ask::Records(ids) => {

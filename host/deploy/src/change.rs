@@ -23,8 +23,7 @@ use tokio::{sync::oneshot, time::timeout};
 use tracing::{Instrument as _, info_span};
 
 use crate::{
-    SPANS,
-    admission,
+    SPANS, admission,
     bench::stopping,
     change::readiness::Readiness,
     draft::LoopDraft,

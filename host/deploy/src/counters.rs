@@ -15,6 +15,11 @@ impl Room {
         let now = Instant::now();
         let get = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
         let log = self.cycles.as_ref().map(|cycles| cycles.counts()).unwrap_or_default();
+        let kept = self
+            .archive
+            .as_ref()
+            .map(|archive| archive.counts())
+            .unwrap_or_default();
         let mut counters = Counters {
             hosts_alive: self.roster.all().iter().filter(|(_, seen)| seen.alive(now)).count() as u64,
             loops_known: self.book.len() as u64,
@@ -37,6 +42,12 @@ impl Room {
             cycles_unrecorded: log.dropped,
             cycle_log_damaged: log.damaged,
             cycle_log_bytes: log.bytes,
+            history_taken: kept.taken,
+            history_dropped: kept.dropped + kept.dropped_rows,
+            history_damaged: kept.damaged,
+            history_cut_bytes: kept.cut_bytes,
+            history_bytes: kept.bytes,
+            history_failing: kept.failing,
             ..Counters::default()
         };
         for intent in self.book.all().iter().filter(|intent| intent.home == self.here) {

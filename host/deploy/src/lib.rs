@@ -18,6 +18,7 @@
 //! `book`, `library`, `roster`, `feed` (what it keeps); `admission`, `bench`, `holder`, `home`, `preference`, `drain`, `expect`,
 //! `change`, `orders`, `health` (what it does);
 //! `trials` with `rehearsal`, `verdict`, `replay`, `shadows`, `curve`, `report` (looking back, and trying candidates);
+//! `history` (what was, for years);
 //! `rollout` (one component for many loops, by rule);
 //! `sync`, `answers`, `service`, `room`, `deploy` (how it hangs together).
 
@@ -38,6 +39,7 @@ mod expect;
 mod feed;
 mod field;
 mod health;
+pub mod history;
 mod holder;
 mod home;
 mod library;

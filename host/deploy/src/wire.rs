@@ -19,6 +19,7 @@ use crate::{
     error::{Error, Words},
     expect::Expect,
     health::HealthView,
+    history::{HistoryAsk, HistoryTold},
     report::{CyclesView, ReplayReport, ShadowView, Trial, TrialReport},
     rollout::RolloutView,
     view::{ApplyEnd, CommandEnd, DrainEnd, DrainOrder, PointView, Stage},
@@ -95,6 +96,8 @@ pub(crate) enum Ask {
     Alarm(AlarmAsk),
     /// To an I/O host: these points now, at most a page of them.
     Read(Vec<PointId>),
+    /// What the host has of a loop's or a point's history.
+    History(Box<HistoryAsk>),
 }
 
 /// What may be asked about alarms.
@@ -223,6 +226,8 @@ pub(crate) enum Told {
     Read(Vec<Option<(Reading, u64)>>),
     /// What was asked about points, buses, forces and jobs.
     Field(Box<FieldTold>),
+    /// History.
+    History(Box<HistoryTold>),
     /// A component's bytes. Never written by serde: see [`encode_reply`].
     #[serde(skip)]
     Bytes(Vec<u8>),
