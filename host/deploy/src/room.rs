@@ -312,11 +312,9 @@ impl Room {
     pub(crate) fn stop(&self) {
         self.stop.send_replace(true);
         self.shadows.close();
-        if let Some(archive) = &self.archive
+        if let Some(archive) = &self.archive {
             // So that its thread is never the last who has the room.
-            && let Err(error) = archive.judge_by(Box::new(|_| None))
-        {
-            tracing::debug!(%error, "the history ends with its thread");
+            archive.stop_judging();
         }
     }
 

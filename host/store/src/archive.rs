@@ -209,12 +209,19 @@ impl Archive {
         })
     }
 
-    /// Who says which loops are kept, and how they are read, from now on.
+    /// Who says which loops are kept, and how they are read: of everything that is offered after this returns.
     ///
     /// # Errors
-    /// [`Error::Slow`].
+    /// [`Error::Slow`] after 10 s.
     pub fn judge_by(&self, judge: Judge) -> Result<(), Error> {
-        self.requests.try_send(Request::Judge(judge)).map_err(|_| self.slow())
+        self.ask(|answer| Request::Judge(Some(judge), answer))
+    }
+
+    /// Keeps no loop any more, soon, and lets go of who said which. Does not wait.
+    pub fn stop_judging(&self) {
+        let (answer, _nobody) = sync_channel(1);
+        // Where the thread has so much to do, it ends with the archive.
+        let _ = self.requests.try_send(Request::Judge(None, answer));
     }
 
     /// Takes a record. Never blocks, and takes no lock that the thread holds.

@@ -70,8 +70,8 @@ pub(super) enum Offer {
 }
 
 pub(super) enum Request {
-    /// Who says what is kept.
-    Judge(Judge),
+    /// Who says what is kept; none to keep no loop any more.
+    Judge(Option<Judge>, SyncSender<()>),
     /// Bring everything to the journal and say how it went; with `true` pack it too.
     Flush(bool, SyncSender<Result<(), Error>>),
     /// Flush, and end.
@@ -127,7 +127,11 @@ impl Writer {
             self.gather();
             match request {
                 Err(RecvTimeoutError::Timeout) => {}
-                Ok(Request::Judge(judge)) => self.judge = Some(judge),
+                Ok(Request::Judge(judge, answer)) => {
+                    self.judge = judge;
+                    self.judged.clear();
+                    let _ = answer.try_send(());
+                }
                 // Nobody may be waiting for an answer any more; what was asked is done either way.
                 Ok(Request::Flush(packed, answer)) => {
                     let end = self.write().and_then(|()| if packed { self.pack() } else { Ok(()) });
