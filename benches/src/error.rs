@@ -38,6 +38,9 @@ pub(crate) enum Error {
     /// The lab.
     #[error("the lab")]
     Lab(#[from] bumpless_lab::Error),
+    /// The disk.
+    #[error("the store")]
+    Store(#[from] bumpless_store::Error),
     /// The loops.
     #[error("the loops did not take it")]
     Loops(#[from] bumpless_loops::Error),

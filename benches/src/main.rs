@@ -5,6 +5,7 @@
 //! Never: a timing that a test depends on; benches are run by people and by the release's checklist.
 
 mod actuator;
+mod archive;
 mod call;
 mod chaos;
 mod chaos_report;
@@ -83,6 +84,8 @@ enum Bench {
     Upload,
     /// Virtual time: hours of the pilot plant per second and core, against the same experiment as plain functions.
     Lab,
+    /// The long memory: cycles in, bytes on disk, a day on a thousand columns.
+    History,
     /// A step native and in the sandbox, and the cycle of a loop whose owner, replica and I/O are one process.
     Step,
     /// 1,000 points on ten Modbus devices at 10 Hz: requests, staleness, processor time; and one device that is slow.
@@ -158,6 +161,7 @@ fn run(bench: &Bench, options: Options) -> Result<bool, Error> {
         Bench::Masters => "masters",
         Bench::Select => "select",
         Bench::Swap(_) => "swap",
+        Bench::History => "history",
         Bench::Lab => "lab",
         Bench::Step => "step",
         Bench::Upload => "upload",
@@ -179,6 +183,7 @@ fn run(bench: &Bench, options: Options) -> Result<bool, Error> {
         Bench::Select => select::run(options, &mut report)?,
         Bench::Swap(switching) if switching.is_wanted() => switch::run(options, *switching, &mut report)?,
         Bench::Swap(_) => swap::run(options, &mut report)?,
+        Bench::History => archive::run(options, &mut report)?,
         Bench::Lab => lab::run(options, &mut report)?,
         Bench::Step => step::run(options, &mut report)?,
         Bench::Upload => upload::run(options, &mut report)?,

@@ -14,6 +14,7 @@
 //! | drain | hosts that are emptied, restarted one by one, preferred, cut off |
 //! | chaos | faults by a seed, under the checker |
 //! | history | replays, backtests, shadows |
+//! | past | the long history: gaps filled by other hosts, kills, points, files |
 //! | rollouts | one component for many loops, one loop first |
 //! | calls | the cell as a control service |
 //! | recovery | a measurement that comes back, under each policy on bad input |
@@ -58,6 +59,7 @@ mod masters;
 mod members;
 mod modbus;
 mod neighbours;
+mod past;
 mod phases;
 mod recovery;
 mod refusals;

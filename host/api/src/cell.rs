@@ -4,7 +4,7 @@
 
 use std::{future::Future, pin::Pin, sync::Arc};
 
-use bumpless_core::{CommandBody, CommandId, ComponentInfo, Digest, HostId, LoopId, Record};
+use bumpless_core::{CommandBody, CommandId, ComponentInfo, Digest, HostId, LoopId, Record, history::Series};
 use bumpless_deploy::{
     ApplyEnd, Call, CallEnd, Change, CommandEnd, ComponentView, Counters, Deploy, DrainEnd, DrainOrder, Error, Expect,
     HealthView, HostView, Imported, LoopDraft, LoopView, PointView, Relabel, StageView, Upload,
@@ -12,6 +12,7 @@ use bumpless_deploy::{
 use bumpless_deploy::{
     Window,
     alarms::{AlarmAct, AlarmEvent, AlarmList, AlarmView},
+    history::{HistoryQuestion, HistoryView},
     report::{CyclesView, ReplayReport, ShadowView, Trial, TrialReport},
     rollout::{RolloutDraft, RolloutList, RolloutView},
 };
@@ -44,6 +45,8 @@ pub(crate) trait Cell: Field + Trail {
     fn delete(&self, id: LoopId, expect: Expect) -> Answer<()>;
     fn move_owner(&self, id: LoopId, to: HostId) -> Answer<()>;
     fn cycles(&self, id: LoopId, window: Window, max: u32) -> Answer<CyclesView>;
+    fn history(&self, series: Series, question: HistoryQuestion) -> Answer<HistoryView>;
+    fn history_now_ns(&self, series: &Series) -> u64;
     fn replay(&self, id: LoopId, window: Window) -> Answer<ReplayReport>;
     fn backtest(&self, id: LoopId, trial: Trial, window: Window) -> Answer<TrialReport>;
     fn start_shadow(&self, id: LoopId, trial: Trial, cycles: u64) -> Answer<ShadowView>;
@@ -162,6 +165,15 @@ impl Cell for Deploy {
     fn cycles(&self, id: LoopId, window: Window, max: u32) -> Answer<CyclesView> {
         let deploy = self.clone();
         Box::pin(async move { deploy.cycles(&id, window, max).await })
+    }
+
+    fn history(&self, series: Series, question: HistoryQuestion) -> Answer<HistoryView> {
+        let deploy = self.clone();
+        Box::pin(async move { deploy.history(series, question).await })
+    }
+
+    fn history_now_ns(&self, series: &Series) -> u64 {
+        self.history_now_ns(series)
     }
 
     fn replay(&self, id: LoopId, window: Window) -> Answer<ReplayReport> {

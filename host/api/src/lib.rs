@@ -21,6 +21,7 @@ mod asker;
 mod cell;
 mod door;
 mod error;
+mod export;
 mod extract;
 mod field;
 mod gate;

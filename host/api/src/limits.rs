@@ -57,6 +57,15 @@ pub const FEED_LOOPS_MAX: usize = 64;
 /// Recorded cycles of one answer, where the asker says nothing.
 pub const CYCLES_DEFAULT: u64 = 100;
 
+/// Pieces of history in one answer, where the asker says nothing: enough for a curve.
+pub const HISTORY_PIECES_DEFAULT: u32 = 500;
+
+/// Exports of history at once: each has a page of it in memory, some 20 MB.
+pub const EXPORTS_MAX: usize = 4;
+
+/// Longest time of an export: a year of seconds over 50 Mbit/s.
+pub const EXPORT_TIME_MAX: Duration = Duration::from_secs(1_800);
+
 /// Keys of changes that a host remembers, the newest. A hundred changes a second would be much for people and scripts alike;
 /// then a key is still good for 40 s.
 pub const KEYS_MAX: usize = 4_096;

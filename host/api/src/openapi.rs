@@ -9,8 +9,8 @@ use utoipa::OpenApi;
 use crate::{
     error::Problem,
     routes::{
-        alarms, audit, bundle, components, demo, field, health, history, hosts, lab, live, load, loops, pages, rollouts,
-        trend,
+        alarms, audit, bundle, components, demo, field, health, history, hosts, lab, live, load, loops, pages, past,
+        rollouts, trend,
     },
     types,
 };
@@ -27,7 +27,7 @@ use crate::{
         bundle::export, bundle::import,
         loops::list, loops::show, loops::apply, loops::remove, loops::set, loops::swap, loops::rollback, loops::move_owner,
         loops::setpoint, loops::mode, loops::output,
-        history::cycles, history::replay, history::backtest,
+        history::cycles, past::of_loop, past::of_point, history::replay, history::backtest,
         history::start_shadow, history::shadows, history::show_shadow, history::stop_shadow,
         rollouts::start, rollouts::list, rollouts::show, rollouts::stop,
         alarms::list, alarms::past, alarms::show, alarms::act, alarms::define, alarms::remove,
@@ -42,7 +42,7 @@ use crate::{
         (name = "components", description = "The library of control components"),
         (name = "loops", description = "Controllers bound to points"),
         (name = "commands", description = "What an operator asks of a running loop; answered when a committed record holds it"),
-        (name = "history", description = "Looking back: recorded cycles, replays, and candidates tried on them or beside a running loop"),
+        (name = "history", description = "Looking back: recorded cycles, years of thinned history, replays, and candidates tried on them or beside a running loop"),
         (name = "rollouts", description = "One component for many loops: one loop first, then the rest by rule"),
         (name = "alarms", description = "What stands, what happened, and what people do about it, by ANSI/ISA-18.2"),
         (name = "audit", description = "Who changed what: a chain of entries on each host, listed, verified, exported"),

@@ -17,6 +17,7 @@ pub(crate) mod load;
 pub(crate) mod loops;
 pub(crate) mod page;
 pub(crate) mod pages;
+pub(crate) mod past;
 pub(crate) mod rollouts;
 pub(crate) mod trend;
 
@@ -53,6 +54,8 @@ pub(crate) fn all() -> Router<App> {
         .route("/v1/loops/{name}/rollback", post(loops::rollback))
         .route("/v1/loops/{name}/move", post(loops::move_owner))
         .route("/v1/loops/{name}/cycles", get(history::cycles))
+        .route("/v1/loops/{name}/history", get(past::of_loop))
+        .route("/v1/points/{name}/history", get(past::of_point))
         .route("/v1/loops/{name}/replay", post(history::replay))
         .route("/v1/loops/{name}/backtest", post(history::backtest))
         .route(

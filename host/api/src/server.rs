@@ -37,8 +37,8 @@ use crate::{
     gate::Gate,
     happenings::Happenings,
     limits::{
-        BUNDLE_TIME_MAX, CALL_TIME_MAX, CHANGE_TIME_MAX, FEEDS_MAX, PORT_TABLES_MAX, REQUEST_TIME_MAX, REQUESTS_MAX,
-        STOP_TIME_MAX, UPLOAD_TIME_MAX, UPLOADS_MAX,
+        BUNDLE_TIME_MAX, CALL_TIME_MAX, CHANGE_TIME_MAX, EXPORTS_MAX, FEEDS_MAX, PORT_TABLES_MAX, REQUEST_TIME_MAX,
+        REQUESTS_MAX, STOP_TIME_MAX, UPLOAD_TIME_MAX, UPLOADS_MAX,
     },
     metrics::Metrics,
     notices::Notices,
@@ -87,6 +87,8 @@ pub(crate) struct App {
     pub(crate) feeds: Arc<Semaphore>,
     /// Places for the bytes of uploads.
     pub(crate) uploads: Arc<Semaphore>,
+    /// Places for exports of history.
+    pub(crate) exports: Arc<Semaphore>,
     /// Turns true when the host stops.
     pub(crate) stop: watch::Receiver<bool>,
     /// What people should hear of.
@@ -116,6 +118,7 @@ impl App {
                 .unwrap_or_else(|| Arc::new(Metrics::new(Arc::clone(&cell)))),
             feeds: Arc::new(Semaphore::new(options.feeds_max)),
             uploads: Arc::new(Semaphore::new(UPLOADS_MAX)),
+            exports: Arc::new(Semaphore::new(EXPORTS_MAX)),
             requests: Arc::new(Semaphore::new(options.requests_max)),
             ports: Arc::default(),
             notices: Arc::new(Notices::new()),

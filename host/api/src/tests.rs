@@ -71,6 +71,14 @@ impl Bench {
             .expect("a router always answers")
     }
 
+    /// Status and the body's bytes.
+    async fn bytes(&self, request: Request<Body>) -> (StatusCode, Vec<u8>) {
+        let response = self.ask(request).await;
+        let status = response.status();
+        let bytes = axum::body::to_bytes(response.into_body(), usize::MAX).await;
+        (status, bytes.expect("a body").to_vec())
+    }
+
     /// Status and JSON (null where the body is none).
     async fn json(&self, request: Request<Body>) -> (StatusCode, Value) {
         let response = self.ask(request).await;

@@ -18,6 +18,7 @@ mod live;
 mod load;
 mod loops;
 mod news;
+mod past;
 mod record;
 mod rollouts;
 mod words;
@@ -48,6 +49,7 @@ pub use loops::{
     Policy, RollbackRequest, SetRequest, SetpointRequest, SwapRequest, Tally,
 };
 pub use news::{FieldNews, PointForced, PointUnforced, PointWritten, StandbyTold};
+pub use past::{History, HistoryPart, HistoryStretch, HistoryValues};
 pub use record::{Alarm, Applied, Aside, Event, LogLine, Message, Reading, Record, Redundancy, Vote};
 pub use rollouts::{OnFailure, Rollout, RolloutLoop, RolloutRequest, RolloutStage, RolloutState, Rollouts, SilentHost};
 pub use words::{Direction, LogLevel, Mode, OnBump, OnFault, OnFewer, PortKind, Priority, Quality, Strategy};
@@ -55,6 +57,7 @@ pub use words::{Direction, LogLevel, Mode, OnBump, OnFault, OnFewer, PortKind, P
 pub(crate) use history::window;
 pub(crate) use load::silent;
 pub(crate) use loops::Depth;
+pub(crate) use past::{output, output_names};
 pub(crate) use record::{PortTable, PortTables};
 
 use base64::{Engine as _, engine::general_purpose::STANDARD};

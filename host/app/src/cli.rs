@@ -14,6 +14,7 @@ mod history;
 pub(crate) mod io;
 mod lab;
 mod library;
+mod past;
 mod rollout;
 
 pub(crate) use alarm::{AlarmCommand, Of as AlarmOf};
@@ -22,6 +23,7 @@ pub(crate) use cell::HostsCommand;
 pub(crate) use history::HistoryCommand;
 pub(crate) use lab::{LabArgs, LabCommand, LabRunArgs};
 pub(crate) use library::{ComponentsArgs, ComponentsCommand, FilterArgs, UploadArgs};
+pub(crate) use past::{FormatWord, HistoryArgs};
 pub(crate) use rollout::{RolloutArgs, RolloutCommand};
 
 use crate::{client::Client, commands, demo, error::Error, host, watch};
@@ -92,6 +94,8 @@ pub(crate) enum Command {
         #[command(subcommand)]
         what: Option<AuditCommand>,
     },
+    /// What a loop or a point did, for years: a table, or a CSV, JSON or Parquet file.
+    History(HistoryArgs),
     /// Control experiments in virtual time: run, compare, sweep, report; from a recorded loop, and to a live one.
     Lab(LabArgs),
     /// Points and devices: scan, read, write, watch, force, jobs, point lists.
@@ -360,6 +364,7 @@ pub fn run(cli: Cli) -> Result<(), Error> {
             json,
             what.unwrap_or_else(|| AuditCommand::List(AuditListArgs::default())),
         ),
+        Command::History(args) => commands::past::run(&client()?, json, &args),
         Command::Lab(LabArgs { what }) => commands::lab::run(client, json, what),
         Command::Io { what } => commands::io::run(client, json, what),
         Command::Call(args) => commands::components::call(&client()?, json, args),
@@ -415,6 +420,9 @@ mod tests {
             "bumpless loop rollback pressure --to 3",
             "bumpless loop cycles pressure",
             "bumpless loop replay pressure --last 10m",
+            "bumpless history pressure",
+            "bumpless history pressure --from -7d --to -1d --buckets 100 --json",
+            "bumpless history plant.tt101 --point --from 2026-11-22T08:00:00Z --step 1s --format parquet -o x.parquet",
             "bumpless rollout start pid@1.1.0 pressure level --cycles 100 --factor 1.5 --at-once 2 --on-failure back --wait",
             "bumpless rollout start pid --all-of pid@1.0.0 -p k=2 -p action=direct --json",
             "bumpless rollout list",

@@ -13,5 +13,6 @@ pub(crate) mod jobs;
 pub(crate) mod lab;
 pub(crate) mod library;
 pub(crate) mod loops;
+pub(crate) mod past;
 pub(crate) mod point_lists;
 pub(crate) mod rollouts;

@@ -20,7 +20,7 @@ use bumpless_io::{Clock, IoServer};
 use bumpless_lab::Library;
 use bumpless_loops::{Loops, LoopsEvent};
 use bumpless_scada::Servers;
-use bumpless_store::{CycleLog, RecordWriter, Store};
+use bumpless_store::{Archive, CycleLog, RecordWriter, Store};
 use tokio::{
     net::TcpListener,
     sync::{mpsc, watch},
@@ -110,13 +110,18 @@ pub async fn run(config: Config, faults: Option<mpsc::Sender<Fault>>) -> Result<
     let writer = RecordWriter::start(store.clone()).map_err(|e| Error::start("the record writer", e))?;
     // Cycles are recorded at the loops' homes, and only a host with points is one.
     let (log_of, bytes_max) = (store.clone(), config.history_bytes_max.filter(|_| config.io));
+    let cycles_keep_ns = config.cycles_keep_ns;
     let cycles = blocking(move || {
         bytes_max
-            .map(|bytes_max| CycleLog::open(&log_of, bytes_max))
+            .map(|bytes_max| CycleLog::open(&log_of, bytes_max, cycles_keep_ns))
             .transpose()
     })
     .await?
     .map_err(|e| Error::start("the log of cycles", e))?;
+    let (archive_of, bounds) = (store.clone(), config.history);
+    let archive = blocking(move || bounds.map(|bounds| Archive::open(&archive_of, bounds)).transpose())
+        .await?
+        .map_err(|e| Error::start("the history", e))?;
     let mut engine_config = config.engine.clone();
     engine_config.cache_dir = Some(config.data.join("compiled"));
     engine_config.cache_key = store
@@ -136,6 +141,11 @@ pub async fn run(config: Config, faults: Option<mpsc::Sender<Fault>>) -> Result<
         let server = blocking(move || IoServer::open_with(&buses, clock, &runtime, &plants))
             .await?
             .map_err(|e| Error::start("the I/O", e))?;
+        if let Some(missing) = config.history_points.iter().find(|point| server.index(point).is_none()) {
+            let reason =
+                format!("points under [history]: this host has no point {missing}; list the points for their names");
+            return Err(Error::start("the history", reason));
+        }
         Some(Arc::new(server))
     } else {
         None
@@ -194,6 +204,8 @@ pub async fn run(config: Config, faults: Option<mpsc::Sender<Fault>>) -> Result<
         store,
         writer: Arc::new(writer),
         cycles: cycles.map(Arc::new),
+        archive: archive.map(Arc::new),
+        history_points: config.history_points.clone(),
         engine,
         io: io.clone(),
         clock,

@@ -14,9 +14,15 @@
 //! [api]
 //! listen = "127.0.0.1:8480"
 //!
-//! [history]                        # of the loops at home here
+//! [history]                        # of the loops at home or held here
 //! enabled = true
-//! bytes_max_mib = 512              # then the oldest cycles go
+//! bytes_max_mib = 512              # for single cycles; then the oldest go
+//! cycles_days_max = 30             # single cycles older than this go
+//! thinned_mib_max = 1024           # for history of 1 s, 10 s, 1 min, 15 min; then the oldest of the finest go
+//! seconds_days_max = 30            # pieces of 1 s and of 10 s
+//! minutes_days_max = 400           # of 1 min
+//! quarters_days_max = 3700         # of 15 min
+//! points = ["plant.tt101"]         # kept too, whether a loop uses them or not
 //!
 //! [otlp]                           # metrics and traces for a collector; nothing is sent without this table
 //! endpoint = "http://127.0.0.1:4318"
@@ -63,17 +69,19 @@ use std::{
     time::Duration,
 };
 
-use bumpless_core::{CellName, HostId};
+use bumpless_core::{CellName, HostId, PointId};
 use bumpless_deploy::{HostAlarms, webhook::WebhookConfig};
 use bumpless_io::BusConfig;
 use bumpless_scada::ModbusServerConfig;
 use serde::{Deserialize, Serialize};
 
+mod history;
 mod itself;
 mod lab;
 mod testing;
 
 use crate::{error::Error, realtime::Realtime};
+use history::HistoryTable;
 use lab::LabTable;
 use testing::TestingTable;
 
@@ -121,6 +129,12 @@ pub struct Config {
     pub host_alarms: HostAlarms,
     /// Who is told of alarms.
     pub webhooks: Vec<WebhookConfig>,
+    /// How long they are kept, in ns.
+    pub cycles_keep_ns: u64,
+    /// Bounds of the thinned history; none to keep none.
+    pub history: Option<bumpless_store::Bounds>,
+    /// Points of which history is kept, whether a loop uses them or not.
+    pub history_points: Vec<PointId>,
     /// Points and loops of the cell as Modbus registers.
     pub modbus_servers: Vec<ModbusServerConfig>,
 }
@@ -242,24 +256,6 @@ enum CompileWord {
 struct LoopsTable {
     #[serde(skip_serializing_if = "Option::is_none")]
     workers: Option<usize>,
-}
-
-/// Recorded cycles of the loops at home here.
-#[derive(Debug, Clone, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-struct HistoryTable {
-    enabled: bool,
-    bytes_max_mib: u64,
-}
-
-impl Default for HistoryTable {
-    fn default() -> Self {
-        // Hours of a dozen loops at 10 Hz, and no surprise on a small disk.
-        Self {
-            enabled: true,
-            bytes_max_mib: 512,
-        }
-    }
 }
 
 /// The audit trail.
@@ -386,6 +382,7 @@ impl File {
                 "io = false, but there are buses; remove them, or the key".into(),
             ));
         }
+        let kept = self.history.checked(io, &wrong)?;
         let control = self.roles.control.unwrap_or(!has_buses);
         if !io && !control {
             return Err(wrong(
@@ -407,12 +404,15 @@ impl File {
             buses,
             engine: self.engine.checked(&wrong)?,
             loops,
-            history_bytes_max: self.history.checked(&wrong)?,
             otlp: self.otlp,
             lab_reports: self.lab.reports(folder),
             audit_bytes_max: self.audit.checked(&wrong)?,
             host_alarms: itself::alarms(self.alarms, &wrong)?,
             webhooks: itself::webhooks(self.webhook, folder, &wrong)?,
+            history_bytes_max: kept.cycles_bytes_max,
+            cycles_keep_ns: kept.cycles_keep_ns,
+            history: kept.thinned,
+            history_points: kept.points,
             modbus_servers,
         })
     }
@@ -470,17 +470,6 @@ impl LoopsTable {
             workers: in_range(wrong, "loops.workers", self.workers, default.workers, 1, 64)?,
             ..default
         })
-    }
-}
-
-impl HistoryTable {
-    fn checked(&self, wrong: &dyn Fn(&str, String) -> Error) -> Result<Option<u64>, Error> {
-        let (low, high) = (
-            bumpless_store::CYCLE_BYTES_MAX.start() >> 20,
-            bumpless_store::CYCLE_BYTES_MAX.end() >> 20,
-        );
-        let mib = in_range(wrong, "history.bytes_max_mib", Some(self.bytes_max_mib), 0, low, high)?;
-        Ok(self.enabled.then_some(mib << 20))
     }
 }
 

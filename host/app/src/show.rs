@@ -96,6 +96,14 @@ pub(crate) fn age(ms: u64) -> String {
     }
 }
 
+/// A time in µs since 1970 as RFC 3339 has it, in UTC, to the second.
+pub(crate) fn utc(us: u64) -> String {
+    let us = i64::try_from(us).unwrap_or(i64::MAX);
+    chrono::DateTime::from_timestamp_micros(us)
+        .map(|time| time.to_rfc3339_opts(chrono::SecondsFormat::Secs, true))
+        .unwrap_or_default()
+}
+
 /// Bytes as people say them.
 pub(crate) fn size(bytes: u64) -> String {
     match bytes {

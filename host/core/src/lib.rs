@@ -6,8 +6,8 @@
 //! same code runs in a host, in a test and under a model checker.
 //!
 //! Reading order: the nouns (`name` to `record`), the messages (`protocol`), then the decisions along one cycle
-//! (`tick`, `desk` with `arbiter`, `seat` with `select`, `vote` and `swap`, `guard`), then `place`, `indices`, `alarms` and
-//! `audit`.
+//! (`tick`, `desk` with `arbiter`, `seat` with `select`, `vote` and `swap`, `guard`), then `place`, `indices`, `alarms`,
+//! `audit` and `history`.
 
 pub mod limits;
 
@@ -32,6 +32,7 @@ pub mod chatter;
 pub mod damping;
 pub mod desk;
 pub mod guard;
+pub mod history;
 pub mod indices;
 pub mod lease;
 pub mod place;

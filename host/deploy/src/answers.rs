@@ -77,6 +77,7 @@ impl Room {
                 Ask::Webhooks => Ok(Told::Webhooks(self.webhooks.views())),
                 Ask::AlarmLoad => self.alarm_load_here().await.map(Box::new).map(Told::AlarmLoad),
                 Ask::Audit(ask) => self.audit_here(ask).await,
+                Ask::History(ask) => self.history_here(*ask).await.map(Box::new).map(Told::History),
                 Ask::Rollout(ask) => self.rollout_here(ask).await,
                 Ask::Field(ask) => self.field_here(*ask).await.map(Box::new).map(Told::Field),
                 Ask::Records(ids) => {

@@ -15,6 +15,11 @@ impl Room {
         let (now, hosts) = (Instant::now(), self.session.hosts().len());
         let get = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
         let log = self.cycles.as_ref().map(|cycles| cycles.counts()).unwrap_or_default();
+        let kept = self
+            .archive
+            .as_ref()
+            .map(|archive| archive.counts())
+            .unwrap_or_default();
         let mut counters = Counters {
             hosts_alive: self
                 .roster
@@ -50,6 +55,12 @@ impl Room {
             clock_offset_ms: self.self_watch.offset_ms(),
             disk_free_bytes: self.self_watch.free_bytes(),
             webhooks: self.webhooks.views(),
+            history_taken: kept.taken,
+            history_dropped: kept.dropped + kept.dropped_rows,
+            history_damaged: kept.damaged,
+            history_cut_bytes: kept.cut_bytes,
+            history_bytes: kept.bytes,
+            history_failing: kept.failing,
             ..Counters::default()
         };
         {

@@ -215,6 +215,11 @@ impl Deploy {
             Some(cycles) => room.feed.flush().and(cycles.flush()),
             None => room.feed.flush(),
         };
+        let room = Arc::clone(&self.room);
+        let flush = move || match &room.archive {
+            Some(archive) => flush().and(archive.flush()),
+            None => flush(),
+        };
         match on_disk(flush).await {
             Ok(Ok(())) => {}
             Ok(Err(error)) => tracing::warn!(%error, "the last records are not on disk"),

@@ -18,7 +18,8 @@
 //! `book`, `library`, `roster`, `feed` (what it keeps); `admission`, `bench`, `holder`, `home`, `preference`, `drain`, `expect`,
 //! `change`, `orders`, `health` (what it does);
 //! `trials` with `rehearsal`, `verdict`, `replay`, `shadows`, `curve`, `report` (looking back, and trying candidates);
-//! `rollout` (one component for many loops, by rule); `audit` (who changed what); `webhook`, `self_watch`;
+//! `rollout` (one component for many loops, by rule); `history` (what was, for years); `audit` (who changed what);
+//! `webhook`, `self_watch`;
 //! `sync`, `answers`, `service`, `room`, `deploy` (how it hangs together).
 
 mod admission;
@@ -39,6 +40,7 @@ mod expect;
 mod feed;
 mod field;
 mod health;
+pub mod history;
 mod holder;
 mod home;
 mod library;

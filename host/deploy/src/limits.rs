@@ -164,6 +164,30 @@ pub const REHEARSAL_WAIT: Duration = Duration::from_secs(28);
 /// Replays and backtests at one home at a time: each takes a core, at the lowest priority.
 pub const REHEARSALS_MAX: usize = 2;
 
+/// Pieces of history in one answer of a host to another, of each step: some 2 MB.
+pub const HISTORY_ROWS_TOLD_MAX: usize = 20_000;
+
+/// Cycles that one answer about history reads from the log: half a second of work.
+pub const HISTORY_CYCLES_MAX: u64 = 40_000;
+
+/// Pieces that a window is told in: a wide screen has no more columns.
+pub const HISTORY_BUCKETS_MAX: u32 = 4_000;
+
+/// Longest window of history, in ns: 20 years.
+pub const HISTORY_SPAN_NS_MAX: u64 = 20 * 366 * 86_400 * 1_000_000_000;
+
+/// Longest time that one question about history is worked on; then it is answered as far as it came.
+pub const HISTORY_TIME_MAX: Duration = Duration::from_secs(8);
+
+/// How long the other hosts may take to fill a gap: whoever looks at a curve waits.
+pub const HISTORY_OTHERS_WAIT: Duration = Duration::from_secs(2);
+
+/// How often a point of which history is kept is read: a second has some values, and a thousand points cost nothing.
+pub const POINT_HISTORY_EVERY: Duration = Duration::from_millis(200);
+
+/// Points of which a host keeps history.
+pub const HISTORY_POINTS_MAX: usize = 2_000;
+
 /// Recorded cycles in one answer, and their bytes, about.
 pub const RECORDS_TOLD_MAX: usize = 1_000;
 

@@ -18,11 +18,11 @@ use std::{
 };
 
 use bumpless_cell::{Arrival, Probe, Roles, Session, Vitals};
-use bumpless_core::{CommandId, Digest, HostId, LoopId};
+use bumpless_core::{CommandId, Digest, HostId, LoopId, PointId};
 use bumpless_engine::Engine;
 use bumpless_io::{Clock, IoServer};
 use bumpless_loops::LoopsEvent;
-use bumpless_store::{CycleLog, RecordWriter, Store};
+use bumpless_store::{Archive, CycleLog, RecordWriter, Store};
 use parking_lot::Mutex;
 use tokio::{
     runtime::Handle,
@@ -64,6 +64,10 @@ pub struct Parts {
     pub writer: Arc<RecordWriter>,
     /// Keeps every cycle of the loops at home here; none to keep none. Whoever made it closes it.
     pub cycles: Option<Arc<CycleLog>>,
+    /// Keeps thinned history of the loops that are at home or held here; none to keep none. Ends with the last who has it.
+    pub archive: Option<Arc<Archive>>,
+    /// Points of this host of which history is kept, whether a loop uses them or not.
+    pub history_points: Vec<PointId>,
     /// The sandbox. Every host has one, because every host takes uploads.
     pub engine: Engine,
     /// The points of this host, if it serves any.
@@ -156,6 +160,7 @@ pub(crate) struct Room {
     pub(crate) roster: Roster,
     pub(crate) feed: Feed,
     pub(crate) cycles: Option<Arc<CycleLog>>,
+    pub(crate) archive: Option<Arc<Archive>>,
     pub(crate) shadows: Shadows,
     pub(crate) rollouts: Ledger,
     pub(crate) alarms: Alarms,
@@ -203,6 +208,8 @@ impl Room {
             store,
             writer,
             cycles,
+            archive,
+            history_points,
             engine,
             io,
             clock,
@@ -250,6 +257,7 @@ impl Room {
             roster: Roster::new(own.clone()),
             feed: Feed::new(writer),
             cycles,
+            archive,
             shadows: Shadows::default(),
             rollouts: Ledger::default(),
             alarms: Alarms::default(),
@@ -289,6 +297,10 @@ impl Room {
             room.feed.remember(&Arc::new(record));
         }
         room.forget_strangers();
+        if let Some(archive) = &room.archive {
+            let keeper = Arc::downgrade(&room);
+            archive.judge_by(Box::new(move |record| keeper.upgrade()?.history_lens(record)))?;
+        }
         for host in room.session.hosts() {
             room.roster.up(&host);
         }
@@ -306,6 +318,9 @@ impl Room {
         room.resume_forces()?;
         room.spawn(Self::watch_queues(Arc::clone(&room)));
         room.watch_masters();
+        if !history_points.is_empty() {
+            room.spawn(Self::watch_points(Arc::clone(&room), history_points));
+        }
         Ok(room)
     }
 
@@ -323,6 +338,10 @@ impl Room {
     pub(crate) fn stop(&self) {
         self.stop.send_replace(true);
         self.shadows.close();
+        if let Some(archive) = &self.archive {
+            // So that its thread is never the last who has the room.
+            archive.stop_judging();
+        }
     }
 
     pub(crate) fn stopped(&self) -> bool {
@@ -387,10 +406,14 @@ impl Room {
                     self.look_for_fallback(&record);
                 }
                 self.keep_cycle(&record);
+                self.keep_history(&record);
                 self.feed.pass(record);
             }
             DeployArrival::Loops(LoopsEvent::Outcome { record, alone }) => self.feed.keep(record, alone),
-            DeployArrival::Bus(Arrival::Record(record)) => self.feed.pass(record),
+            DeployArrival::Bus(Arrival::Record(record)) => {
+                self.keep_history(&record);
+                self.feed.pass(record);
+            }
             // The record with it has passed before, or does now; the reconciliation reads it from there.
             DeployArrival::Loops(LoopsEvent::Revised { loop_id, revision }) => {
                 self.homes.revised(&loop_id, revision);

@@ -381,4 +381,16 @@ pub struct Counters {
     pub disk_free_bytes: Option<u64>,
     /// How its webhooks do.
     pub webhooks: Vec<crate::webhook::WebhookView>,
+    /// Cycles and values of points that are in the history.
+    pub history_taken: u64,
+    /// Those that are not, because too many waited or the disk took nothing.
+    pub history_dropped: u64,
+    /// Blocks of the history that could not be read; each reading counts.
+    pub history_damaged: u64,
+    /// Bytes of the history that were left out at the start because a write had broken off.
+    pub history_cut_bytes: u64,
+    /// Bytes of the history's files.
+    pub history_bytes: u64,
+    /// Does the disk take no history now?
+    pub history_failing: bool,
 }

@@ -20,6 +20,7 @@ use crate::{
     error::{Error, Words},
     expect::Expect,
     health::HealthView,
+    history::{HistoryAsk, HistoryTold},
     report::{CyclesView, ReplayReport, ShadowView, Trial, TrialReport},
     rollout::RolloutView,
     view::{ApplyEnd, CommandEnd, DrainEnd, DrainOrder, PointView, Stage},
@@ -103,6 +104,8 @@ pub(crate) enum Ask {
     Webhooks,
     /// How many alarms its operators had lately.
     AlarmLoad,
+    /// What the host has of a loop's or a point's history.
+    History(Box<HistoryAsk>),
 }
 
 /// What may be asked about alarms.
@@ -243,6 +246,8 @@ pub(crate) enum Told {
     Read(Vec<Option<(Reading, u64)>>),
     /// What was asked about points, buses, forces and jobs.
     Field(Box<FieldTold>),
+    /// History.
+    History(Box<HistoryTold>),
     /// A component's bytes. Never written by serde: see [`encode_reply`].
     #[serde(skip)]
     Bytes(Vec<u8>),

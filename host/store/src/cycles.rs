@@ -131,11 +131,12 @@ pub struct CycleLog {
 }
 
 impl CycleLog {
-    /// Opens the log in the store's directory, and starts its thread. `bytes_max` bounds its file, about.
+    /// Opens the log in the store's directory, and starts its thread. `bytes_max` bounds its file, about; cycles that are
+    /// `keep_ns` older than the newest go too.
     ///
     /// # Errors
     /// [`Error::Size`] for a bound outside [`BYTES_MAX`], [`Error::Io`], [`Error::Database`], [`Error::Newer`].
-    pub fn open(store: &Store, bytes_max: u64) -> Result<Self, Error> {
+    pub fn open(store: &Store, bytes_max: u64, keep_ns: u64) -> Result<Self, Error> {
         if !BYTES_MAX.contains(&bytes_max) {
             return Err(Error::Size {
                 what: format!("the bound of the log of cycles (at least {} bytes)", BYTES_MAX.start()),
@@ -143,25 +144,25 @@ impl CycleLog {
                 max: usize::try_from(*BYTES_MAX.end()).unwrap_or(usize::MAX),
             });
         }
-        Self::open_bounded(store, bytes_max / DATABASE_TIMES)
+        Self::open_bounded(store, (bytes_max / DATABASE_TIMES, keep_ns))
     }
 
     /// As [`CycleLog::open`], with any bound of the chunks themselves.
-    pub(crate) fn open_bounded(store: &Store, bytes_max: u64) -> Result<Self, Error> {
-        Self::open_with(store, bytes_max, || {
+    pub(crate) fn open_bounded(store: &Store, bounds: (u64, u64)) -> Result<Self, Error> {
+        Self::open_with(store, bounds, || {
             Box::new(|builder, file| builder.create_with_backend(FileBackend::new(file)?))
         })
     }
 
     /// The same, on any disk.
-    pub(crate) fn open_with(store: &Store, bytes_max: u64, opener: impl Fn() -> Opener) -> Result<Self, Error> {
+    pub(crate) fn open_with(store: &Store, bounds: (u64, u64), opener: impl Fn() -> Opener) -> Result<Self, Error> {
         let path = store.directory().join(CYCLES_FILE);
-        let shelf = match Shelf::open(&path, bytes_max, opener()) {
+        let shelf = match Shelf::open(&path, bounds, opener()) {
             Err(error @ (Error::Damaged { .. } | Error::NotAStore { .. })) => {
                 let aside = path.with_extension("damaged");
                 tracing::error!(%error, aside = %aside.display(), "the log of cycles is moved aside, and begins anew");
                 std::fs::rename(&path, &aside).map_err(|error| Error::io("move away", &path, error))?;
-                Shelf::open(&path, bytes_max, opener())?
+                Shelf::open(&path, bounds, opener())?
             }
             other => other?,
         };

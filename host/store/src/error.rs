@@ -44,6 +44,12 @@ pub enum Error {
         /// The newest format that is known here.
         known: u64,
     },
+    /// A file among those of the history that is none of them.
+    #[error("{} is no file of the history: move it away", path.display())]
+    NoHistory {
+        /// The file.
+        path: PathBuf,
+    },
     /// A directory with other things in it.
     #[error("{} holds other files and no store: give an empty or a new directory", path.display())]
     NotAStore {

@@ -10,6 +10,7 @@
 //!   host.redb                infos, intents, tombstones, last records, rollouts, alarms, forces, settings
 //!   cycles.redb              every record of the loops at home here, up to a bound
 //!   audit/<number>.jsonl     who changed what, a chain of lines, up to a bound
+//!   history/                 thinned history of loops and points, up to a bound
 //!   components/<digest>.wasm the bytes, named by what they are
 //!   secrets/<name>           0600, 32 random bytes
 //! ```
@@ -18,12 +19,14 @@
 //! |---|---|---|
 //! | component, info, intent, tombstone, rollout, alarm, force, setting, secret, audit entry | yes, fsync | people were told that it is done |
 //! | recorded cycle | no: within a second | it is for looking back; nothing that runs depends on it |
+//! | history | no: half a second survives no kill, ten no loss of power | as recorded cycles |
 //! | last record | no: within a second | the standbys hold newer ones; a sync per cycle would wear out the disk |
 //!
 //! All calls block on the disk. Async callers use a blocking thread. A wait for another writer is as long as that one's
 //! fsync: the operating system's bound, not ours.
 
 mod alarms;
+mod archive;
 mod audit;
 mod components;
 mod cycles;
@@ -40,6 +43,10 @@ mod writer;
 
 pub use alarms::ALARM_CHANGES_MAX;
 pub use audit::{AUDIT_BYTES_MAX, AuditBegun, AuditFound, AuditHead, AuditLog, Overdue};
+pub use archive::{
+    Archive, ArchiveCounts, BYTES_MAX as HISTORY_BYTES_MAX, Bounds, Judge, Lens, ROWS_MAX as HISTORY_ROWS_MAX, Reading,
+    RowBlock, pack_rows, unpack_rows,
+};
 pub use cycles::{BYTES_MAX as CYCLE_BYTES_MAX, Cursor, CycleCounts, CycleLog, Window};
 pub use error::Error;
 pub use intents::Tombstone;

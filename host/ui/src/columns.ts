@@ -1,13 +1,17 @@
-// A loop's past and present as columns for drawing: what the log told, then what the feed brings.
+// A loop's past and present as columns for drawing: what the history and the log told, then what the feed brings.
 //
 //   view ─ not covered, or too coarse ─► ask the log (half a span more on either side) ─► columns ─┐
+//     └─ beyond the log, or too long for it ─► ask the history: means with least and greatest ─────┤
 //   feed ─► rows behind the last of the log ───────────────────────────────────────────────────────┴─► drawn
 //
-// Never: averages or invents; each entry is a recorded cycle.
+// Never: averages or invents: an entry is a recorded cycle, or a piece of the history with its own mean, least and greatest.
 
 import { get } from "./api";
 import type { Trace } from "./live";
-import type { Notice, Trend } from "./types";
+import type { History, Notice, Trend } from "./types";
+
+/** Longer windows than this, in s, are drawn from the history alone: the log has too many cycles for one answer. */
+const LOG_SPAN_MAX = 3_600;
 
 export interface Columns {
   /** Times in s. */
@@ -24,6 +28,14 @@ export interface Columns {
   online: (number | null)[];
   good: boolean[];
   automatic: boolean[];
+  /** Cycles that the entry stands for; 1 where it is one. */
+  cycles: number[];
+  /** Length of the piece in s; 0 for a cycle. */
+  long: number[];
+  measurement_min: (number | null)[];
+  measurement_max: (number | null)[];
+  outputs_min: (number | null)[][];
+  outputs_max: (number | null)[][];
 }
 
 const empty = (ports: number): Columns => ({
@@ -39,13 +51,21 @@ const empty = (ports: number): Columns => ({
   online: [],
   good: [],
   automatic: [],
+  cycles: [],
+  long: [],
+  measurement_min: [],
+  measurement_max: [],
+  outputs_min: Array.from({ length: ports }, () => []),
+  outputs_max: Array.from({ length: ports }, () => []),
 });
 
 interface Part {
   from: number;
   to: number;
   piece: number;
-  trend: Trend;
+  trend: Trend | null;
+  /** What is before the log. */
+  history: History | null;
 }
 
 /** The log's part of a view. */
@@ -71,7 +91,7 @@ export class Past {
   }
 
   get notices(): Notice[] {
-    return this.part?.trend.notices ?? [];
+    return this.part?.trend?.notices ?? [];
   }
 
   /** Makes sure that a view (in s) is covered; `live_from` is where the feed's rows begin. */
@@ -95,9 +115,22 @@ export class Past {
         const { from, to, points } = this.wanted;
         this.wanted = null;
         const query = `from_unix_us=${Math.max(0, Math.floor(from * 1e6))}&to_unix_us=${Math.ceil(to * 1e6)}&points=${Math.min(4_000, points)}`;
-        const trend = await get<Trend>(`/v1/loops/${encodeURIComponent(this.loop)}/trend?${query}`);
-        this.part = { from, to, piece: (to - from) / points, trend };
-        this.failure = trend.read_to_unix_us < to * 1e6 - 1 ? "only the beginning of this window: it has very many cycles" : "";
+        const path = `/v1/loops/${encodeURIComponent(this.loop)}`;
+        const piece = (to - from) / points;
+        let trend: Trend | null = to - from > LOG_SPAN_MAX ? null : await get<Trend>(`${path}/trend?${query}`);
+        // More cycles than one answer reads.
+        if (trend && trend.read_to_unix_us < to * 1e6 - 1) trend = null;
+        const begin = trend?.at_unix_us[0];
+        const until = begin === undefined ? to : begin / 1e6;
+        let history: History | null = null;
+        if (until - from > Math.max(2, 3 * piece)) {
+          const pieces = Math.max(1, Math.min(4_000, Math.round(points * ((until - from) / (to - from)))));
+          const times = `from=${iso(Math.max(0, from))}&to=${iso(until)}`;
+          // A cell that keeps no history says so; the log is shown all the same.
+          history = await get<History>(`${path}/history?${times}&buckets=${pieces}`).catch(() => null);
+        }
+        this.part = { from, to, piece, trend, history };
+        this.failure = trend || history ? "" : "neither the log nor the history has this window";
         this.changed();
       }
     } catch (error) {
@@ -117,6 +150,7 @@ export class Past {
     const trend = this.part?.trend;
     const first_live = trace.rows[0];
     let last = 0;
+    if (this.part?.history) last = this.pieces(all, this.part.history, ports, low, high, first_live?.at_unix_us ?? Infinity);
     if (trend) {
       for (let i = 0; i < trend.at_unix_us.length; i++) {
         const at = trend.at_unix_us[i] as number;
@@ -137,6 +171,7 @@ export class Past {
         all.online.push(null);
         all.good.push(trend.good[i] as boolean);
         all.automatic.push(trend.automatic[i] as boolean);
+        single(all, ports.length);
       }
     }
     for (const row of trace.rows) {
@@ -154,7 +189,69 @@ export class Past {
       all.online.push(row.online);
       all.good.push(row.quality === "good");
       all.automatic.push(row.mode === "automatic");
+      single(all, ports.length);
     }
     return all;
   }
+
+  /** Puts the pieces of the history before `until` (µs); a gap is an entry without values. Gives the time of the last. */
+  private pieces(all: Columns, history: History, ports: string[], low: number, high: number, until: number): number {
+    let last = 0;
+    let gap = 0;
+    for (let i = 0; i < history.at_unix_us.length; i++) {
+      const at = history.at_unix_us[i] as number;
+      if (at >= until) break;
+      last = at;
+      const long = (history.ms[i] as number) / 1e3;
+      const x = at / 1e6 + long / 2;
+      if (x < low || x > high) continue;
+      for (; gap < history.gaps.length && (history.gaps[gap]?.from_unix_us as number) <= at; gap++) {
+        const from = (history.gaps[gap]?.from_unix_us as number) / 1e6;
+        if (from > low && all.x.length > 0) this.entry(all, ports, from, 0, 0, null, history, 0);
+      }
+      this.entry(all, ports, x, long, history.cycles[i] as number, i, history, history.step_us.mean[i] ?? 0);
+    }
+    return last;
+  }
+
+  private entry(all: Columns, ports: string[], x: number, long: number, cycles: number, i: number | null, history: History, step: number): void {
+    const value = (column: (number | null)[] | undefined): number | null => (i === null ? null : (column?.[i] ?? null));
+    all.x.push(x);
+    all.seq.push(0);
+    all.setpoint.push(value(history.setpoint.mean));
+    all.measurement.push(value(history.measurement.mean));
+    all.measurement_min.push(value(history.measurement.min));
+    all.measurement_max.push(value(history.measurement.max));
+    for (const [n, port] of ports.entries()) {
+      (all.outputs[n] as (number | null)[]).push(value(history.outputs[port]?.mean));
+      (all.outputs_min[n] as (number | null)[]).push(value(history.outputs[port]?.min));
+      (all.outputs_max[n] as (number | null)[]).push(value(history.outputs[port]?.max));
+    }
+    all.by.push("");
+    all.owner.push("");
+    all.step_us.push(step);
+    all.write_us.push(0);
+    all.online.push(null);
+    all.good.push(i === null || history.bad[i] === 0);
+    all.automatic.push(i === null || 2 * (history.manual[i] as number) <= cycles);
+    all.cycles.push(cycles);
+    all.long.push(long);
+  }
+}
+
+/** A single cycle has no band. */
+function single(all: Columns, ports: number): void {
+  all.cycles.push(1);
+  all.long.push(0);
+  all.measurement_min.push(null);
+  all.measurement_max.push(null);
+  for (let n = 0; n < ports; n++) {
+    (all.outputs_min[n] as (number | null)[]).push(null);
+    (all.outputs_max[n] as (number | null)[]).push(null);
+  }
+}
+
+/** A time in s as the API takes it. */
+function iso(s: number): string {
+  return encodeURIComponent(new Date(s * 1e3).toISOString());
 }

@@ -24,7 +24,8 @@ export function duration_us(us: number | null | undefined): string {
 export function span_s(s: number): string {
   if (s < 60) return `${s.toFixed(0)} s`;
   if (s < 3_600) return `${(s / 60).toFixed(0)} min`;
-  return `${(s / 3_600).toFixed(1).replace(".0", "")} h`;
+  if (s < 172_800) return `${(s / 3_600).toFixed(1).replace(".0", "")} h`;
+  return `${(s / 86_400).toFixed(1).replace(".0", "")} d`;
 }
 
 /** Bytes with a decimal prefix. */

@@ -1,5 +1,5 @@
 // The trend of one loop: setpoint, measurement and outputs over time, with the replicas' lane and the times of the steps below.
-// It follows what comes, pans back into the log without a seam, and comes back to now.
+// It follows what comes, pans back into the log and from there into the history without a seam, and comes back to now.
 //
 // Keys: ← → pan, with Shift from cycle to cycle, + − zoom, End now. Never: more redraws than the screen has frames.
 
@@ -14,7 +14,9 @@ import type { Limit } from "./alarms";
 import { draw_limits, with_limits } from "./limits";
 import { colour, colours, host_colour } from "./theme";
 
-const SPANS_S = [30, 60, 300, 900, 3_600, 14_400];
+const SPANS_S = [30, 60, 300, 900, 3_600, 14_400, 86_400, 604_800];
+/** The longest window: a year. */
+const SPAN_MAX_S = 31_622_400;
 
 interface View {
   span: number;
@@ -65,7 +67,8 @@ export function TrendView(props: { loop: string; ports: string[]; replicas: numb
       past.cover(min, max, u.bbox.width / devicePixelRatio, live_from);
       const columns = past.columns(trace, props.ports, min, max);
       shown.current = columns;
-      u.setData([columns.x, columns.setpoint, columns.measurement, ...columns.outputs] as uPlot.AlignedData, false);
+      const bands = [columns.measurement_max, columns.measurement_min, ...props.ports.flatMap((_, n) => [columns.outputs_max[n], columns.outputs_min[n]])];
+      u.setData([columns.x, columns.setpoint, columns.measurement, ...columns.outputs, ...bands] as uPlot.AlignedData, false);
       u.setScale("x", { min, max });
       draw_lanes();
       set_failure(past.failure);
@@ -87,7 +90,7 @@ export function TrendView(props: { loop: string; ports: string[]; replicas: numb
     const [, end] = window_of();
     move({ end: end + part * view.current.span });
   };
-  const zoom = (factor: number): void => move({ span: Math.min(86_400, Math.max(5, view.current.span * factor)) });
+  const zoom = (factor: number): void => move({ span: Math.min(SPAN_MAX_S, Math.max(5, view.current.span * factor)) });
 
   /** The cursor by cycles, for keyboards; it stops the view, so that the cycle stays where it is. */
   const step_cursor = (by: number): void => {
@@ -138,9 +141,13 @@ export function TrendView(props: { loop: string; ports: string[]; replicas: numb
       const to = x_of(x + Math.min(gap, Math.max(period * 1.5, piece * 4)));
       const wide = Math.max(unit * 0.8, to - from);
       const by = columns.by[i] as string;
-      counts.set(by, (counts.get(by) ?? 0) + 1);
-      context.fillStyle = colour_of.get(by) ?? muted;
-      context.fillRect(from, rows.by * unit, wide - (wide > 4 * unit ? unit : 0), 16 * unit);
+      const step_only = columns.cycles[i] !== 1;
+      // A piece of the history does not say who stepped.
+      if (!step_only) {
+        counts.set(by, (counts.get(by) ?? 0) + 1);
+        context.fillStyle = colour_of.get(by) ?? muted;
+        context.fillRect(from, rows.by * unit, wide - (wide > 4 * unit ? unit : 0), 16 * unit);
+      }
       const online = columns.online[i];
       if (online !== null && online !== undefined) {
         const tall = 18 * unit * Math.min(1, online / Math.max(1, props.replicas));
@@ -170,7 +177,7 @@ export function TrendView(props: { loop: string; ports: string[]; replicas: numb
     label(duration_us(top_write), rows.write + 25);
     label("step", rows.step + 12);
     label(duration_us(top_step), rows.step + 25);
-    const total = columns.x.length || 1;
+    const total = [...counts.values()].reduce((sum, n) => sum + n, 0) || 1;
     const shares = [...counts].map(([name, n]): [string, number] => [name, n / total]);
     shares.sort((a, b) => a[0].localeCompare(b[0]));
     set_share((old) => (JSON.stringify(old) === JSON.stringify(shares.map(([n, p]) => [n, Math.round(p * 100) / 100])) ? old : shares.map(([n, p]) => [n, Math.round(p * 100) / 100])));
@@ -237,7 +244,13 @@ export function TrendView(props: { loop: string; ports: string[]; replicas: numb
           points: { show: false },
           paths: uPlot.paths.stepped?.({ align: 1 }),
         })),
+        // Greatest and least of the history's pieces: no lines of their own, only what lies between them.
+        ...["y", "y", ...props.ports.flatMap(() => ["o", "o"])].map((scale) => ({ scale, width: 0, stroke: "transparent", points: { show: false } })),
       ],
+      bands: [0, ...props.ports.map((_, n) => n + 1)].map((n) => {
+        const first = 3 + props.ports.length + 2 * n;
+        return { series: [first, first + 1] as [number, number], fill: `color-mix(in srgb, ${colour(n === 0 ? "pv" : "out")} 25%, transparent)` };
+      }),
       hooks: {
         setCursor: [
           (u) => {
@@ -279,7 +292,7 @@ export function TrendView(props: { loop: string; ports: string[]; replicas: numb
         ],
       },
     };
-    const u = new uPlot(options, [[], [], [], ...props.ports.map(() => [])] as uPlot.AlignedData, element);
+    const u = new uPlot(options, [[], [], [], [], [], ...props.ports.flatMap(() => [[], [], []])] as uPlot.AlignedData, element);
     plot.current = u;
     const resize = new ResizeObserver(() => {
       u.setSize({ width: element.clientWidth, height: element.clientHeight });
@@ -406,7 +419,14 @@ export function TrendView(props: { loop: string; ports: string[]; replicas: numb
         {columns && says ? (
           <>
             <span>{says.time}</span>
-            <span>cycle {columns.seq[i]}</span>
+            {columns.cycles[i] === 1 ? (
+              <span>cycle {columns.seq[i]}</span>
+            ) : (
+              <span>
+                mean of {columns.cycles[i]} cycles in {span_s(columns.long[i] ?? 0)}, PV {value(columns.measurement_min[i], props.measure.high - props.measure.low)} to{" "}
+                {value(columns.measurement_max[i], props.measure.high - props.measure.low)}
+              </span>
+            )}
             <span>
               SP {says.setpoint} · PV {says.measurement} {props.measure.unit}
             </span>
@@ -415,11 +435,14 @@ export function TrendView(props: { loop: string; ports: string[]; replicas: numb
                 {port} {value(columns.outputs[n]?.[i], props.actuate.high - props.actuate.low)} {props.actuate.unit}
               </span>
             ))}
+            {columns.cycles[i] === 1 && (
+              <span>
+                owner {columns.owner[i]}, stepped by {columns.by[i]}
+              </span>
+            )}
             <span>
-              owner {columns.owner[i]}, stepped by {columns.by[i]}
-            </span>
-            <span>
-              step {duration_us(columns.step_us[i])}, written after {duration_us(columns.write_us[i])}
+              step {duration_us(columns.step_us[i])}
+              {columns.cycles[i] === 1 && `, written after ${duration_us(columns.write_us[i])}`}
             </span>
           </>
         ) : (

@@ -347,6 +347,29 @@ export interface Trend {
   notices: Notice[];
 }
 
+export interface HistoryValues {
+  min: (number | null)[];
+  max: (number | null)[];
+  mean: (number | null)[];
+}
+
+export interface History {
+  from_unix_us: number;
+  to_unix_us: number;
+  piece_ms: number;
+  gaps: { from_unix_us: number; to_unix_us: number }[];
+  at_unix_us: number[];
+  ms: number[];
+  cycles: number[];
+  lost: number[];
+  bad: number[];
+  manual: number[];
+  setpoint: HistoryValues;
+  measurement: HistoryValues;
+  outputs: Record<string, HistoryValues>;
+  step_us: HistoryValues;
+}
+
 export interface Trial {
   component: string;
   digest: string;

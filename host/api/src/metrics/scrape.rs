@@ -103,6 +103,21 @@ impl Collector for Scrape {
                 "Entries of the audit trail that were dropped because the disk refused them for too long",
                 c.audit_lost,
             ),
+            (
+                "history_taken",
+                "Cycles and values of points that are in the history",
+                c.history_taken,
+            ),
+            (
+                "history_dropped",
+                "Cycles, values and pieces that the history lost because too many waited or the disk took nothing",
+                c.history_dropped,
+            ),
+            (
+                "history_damaged",
+                "Blocks of the history that could not be read",
+                c.history_damaged,
+            ),
         ] {
             let metric = ConstCounter::new(value);
             metric.encode(encoder.encode_descriptor(name, help, None, metric.metric_type())?)?;
@@ -168,6 +183,20 @@ impl Collector for Scrape {
             metric.encode(encoder.encode_descriptor("disk_free", help, Some(&Unit::Bytes), metric.metric_type())?)?;
         }
         self.webhooks(&mut encoder, &c.webhooks)?;
+        for (name, help, value) in [
+            ("history", "Thinned history on disk", c.history_bytes),
+            (
+                "history_cut",
+                "Left out of the history at the start because a write had broken off",
+                c.history_cut_bytes,
+            ),
+        ] {
+            let metric = ConstGauge::new(value);
+            metric.encode(encoder.encode_descriptor(name, help, Some(&Unit::Bytes), metric.metric_type())?)?;
+        }
+        let metric = ConstGauge::new(u64::from(c.history_failing));
+        let help = "1 while the disk takes no history";
+        metric.encode(encoder.encode_descriptor("history_failing", help, None, metric.metric_type())?)?;
         self.hosts(&mut encoder)?;
         self.loops(&mut encoder)
     }

@@ -8,6 +8,7 @@ use std::sync::{
 use bumpless_core::{
     Applied, CommandBody, CommandId, ComponentInfo, Descriptor, Digest, Direction, Event, HostId, LoopId, LoopSpec,
     Migrated, Mode, Outcome, PointId, Policy, PortKind, PortSpec, Reading, Record, Strategy, desk::Tally,
+    history::Series,
 };
 use bumpless_deploy::{
     ApplyEnd, Call, CallEnd, Change, Check, CommandEnd, ComponentView, Counters, DrainEnd, DrainOrder, Error, Expect,
@@ -16,6 +17,7 @@ use bumpless_deploy::{
 use bumpless_deploy::{
     Window,
     alarms::{AlarmAct, AlarmEvent, AlarmList, AlarmView},
+    history::{HistoryQuestion, HistoryView},
     report::{CyclesView, Finding, ReplayReport, ShadowView, Skipped, Trial, TrialReport},
     rollout::{RolloutDraft, RolloutList, RolloutView, State},
 };
@@ -25,6 +27,7 @@ use tokio::sync::{Notify, broadcast};
 use super::{
     alarms::alarms,
     candidates::{shadow, trial, trial_report},
+    history::history,
     rollouts::rollout,
 };
 use crate::cell::{Answer, Cell};
@@ -54,6 +57,7 @@ pub(crate) struct Fake {
     pub(crate) finished: Arc<AtomicUsize>,
     pub(crate) panics: AtomicBool,
     pub(crate) windows: Mutex<Vec<Window>>,
+    pub(crate) histories: Mutex<Vec<HistoryQuestion>>,
     pub(crate) rollouts: Mutex<Vec<RolloutDraft>>,
     pub(crate) alarm_acts: Mutex<Vec<(String, AlarmAct, String)>>,
     pub(crate) jobs: Mutex<Vec<bumpless_deploy::commissioning::JobDraft>>,
@@ -82,6 +86,7 @@ impl Fake {
             finished: Arc::default(),
             panics: AtomicBool::new(false),
             windows: Mutex::default(),
+            histories: Mutex::default(),
             rollouts: Mutex::default(),
             alarm_acts: Mutex::default(),
             jobs: Mutex::default(),
@@ -433,6 +438,15 @@ impl Cell for Fake {
             more: max < 3,
             unread: 0,
         })
+    }
+
+    fn history(&self, series: Series, question: HistoryQuestion) -> Answer<HistoryView> {
+        self.histories.lock().unwrap().push(question);
+        Box::pin(std::future::ready(history(&series, question)))
+    }
+
+    fn history_now_ns(&self, _: &Series) -> u64 {
+        1_700_000_000_000_000_000
     }
 
     fn replay(&self, loop_id: LoopId, window: Window) -> Answer<ReplayReport> {

@@ -2,12 +2,13 @@
 //!
 //! Never: decides; the loop's home does all of it.
 
-use bumpless_core::LoopId;
+use bumpless_core::{LoopId, history::Series};
 use bumpless_store::Window;
 
 use super::{Deploy, unexpected};
 use crate::{
     error::Error,
+    history::{HistoryQuestion, HistoryView},
     limits::{ANSWER_WAIT, REHEARSAL_WAIT},
     report::{CyclesView, ReplayReport, ShadowView, Trial, TrialReport},
     wire::{Ask, ShadowAsk, Told},
@@ -29,6 +30,21 @@ impl Deploy {
             Told::Cycles(view) => Ok(*view),
             _ => Err(unexpected()),
         }
+    }
+
+    /// What the cell has of a loop's or a point's history: from the host that is nearest to it, gaps filled from all others.
+    ///
+    /// # Errors
+    /// [`Error::NotFound`] where no host ever had any, [`Error::Invalid`] for the question, [`Error::Refused`] where nobody keeps
+    /// history.
+    pub async fn history(&self, series: Series, question: HistoryQuestion) -> Result<HistoryView, Error> {
+        self.room.history(series, question).await
+    }
+
+    /// Now, by the clock that the times of a series are of, in ns since 1970.
+    #[must_use]
+    pub fn history_now_ns(&self, series: &Series) -> u64 {
+        self.room.history_now_ns(series)
     }
 
     /// Makes the recorded steps of a window again, each through the component and the state that it was made with.

@@ -143,6 +143,8 @@ impl Cell {
             writer: Arc::clone(&writer),
             // Its loops only write down what they are asked.
             cycles: None,
+            archive: None,
+            history_points: Vec::new(),
             engine,
             roles: Roles {
                 io: io.is_some(),

@@ -96,11 +96,13 @@ pub(crate) async fn host(cell: &Cell, dir: &std::path::Path) -> Real {
     *loops_slot.lock() = Some(loops.clone());
     let store = Store::open(dir).unwrap();
     let writer = Arc::new(RecordWriter::start(store.clone()).unwrap());
-    let cycles = Arc::new(CycleLog::open(&store, 16 * 1024 * 1024).unwrap());
+    let cycles = Arc::new(CycleLog::open(&store, 16 * 1024 * 1024, u64::MAX).unwrap());
     let deploy = Deploy::start(Parts {
         session: session.clone(),
         writer: Arc::clone(&writer),
         cycles: Some(Arc::clone(&cycles)),
+        archive: None,
+        history_points: Vec::new(),
         store,
         engine,
         io: Some(io),

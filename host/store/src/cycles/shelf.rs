@@ -77,6 +77,8 @@ pub(super) struct Parcel {
 pub(super) struct Shelf {
     base: Base,
     bytes_max: u64,
+    /// Chunks that are so much older than the newest go, in ns.
+    keep_ns: u64,
 }
 
 fn head((term, seq): (u64, u64), row: HeadRow) -> Head {
@@ -101,8 +103,14 @@ fn maybe<T>(table: Result<T, TableError>) -> Result<Option<T>, redb::Error> {
 }
 
 impl Shelf {
-    pub(super) fn open(path: &Path, bytes_max: u64, opener: Opener) -> Result<Self, Error> {
-        Base::open(path, FORMAT, CYCLES, opener).map(|base| Self { base, bytes_max })
+    /// `bounds`: bytes of all chunks, and how long they are kept, in ns.
+    pub(super) fn open(path: &Path, bounds: (u64, u64), opener: Opener) -> Result<Self, Error> {
+        let (bytes_max, keep_ns) = bounds;
+        Base::open(path, FORMAT, CYCLES, opener).map(|base| Self {
+            base,
+            bytes_max,
+            keep_ns,
+        })
     }
 
     pub(super) fn path(&self) -> &Path {
@@ -155,8 +163,13 @@ impl Shelf {
                 bytes += size;
                 next += 1;
             }
+            let newest_ns = parcels.iter().map(|parcel| parcel.head.last_at_ns).max().unwrap_or(0);
             for _ in 0..TRIMMED_MAX {
-                if bytes <= self.bytes_max {
+                let last_at_ns = match ages.first()? {
+                    Some((_, key)) => heads.get(key.value())?.map_or(0, |row| row.value().4),
+                    None => break,
+                };
+                if bytes <= self.bytes_max && last_at_ns.saturating_add(self.keep_ns) >= newest_ns {
                     break;
                 }
                 let Some(oldest) = ages.pop_first()?.map(|(number, key)| {

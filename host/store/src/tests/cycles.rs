@@ -17,7 +17,7 @@ use crate::{CycleLog, Error, Store, Window};
 const MIB: u64 = 1024 * 1024;
 
 fn open(dir: &Path) -> CycleLog {
-    CycleLog::open(&Store::open(dir).unwrap(), 16 * MIB).unwrap()
+    CycleLog::open(&Store::open(dir).unwrap(), 16 * MIB, u64::MAX).unwrap()
 }
 
 fn all(log: &CycleLog, id: &LoopId, window: Window, before: bool) -> Vec<Arc<Record>> {
@@ -93,7 +93,7 @@ fn the_oldest_of_all_loops_go_when_the_bound_is_reached() {
     let dir = tempdir().unwrap();
     let store = Store::open(dir.path()).unwrap();
     let bound = 64 * 1024;
-    let log = CycleLog::open_bounded(&store, bound).unwrap();
+    let log = CycleLog::open_bounded(&store, (bound, u64::MAX)).unwrap();
     let (old, busy) = (loop_id("old"), loop_id("busy"));
     log.offer(record("old", 1, 1));
     log.flush().unwrap();
@@ -125,7 +125,7 @@ fn the_oldest_of_all_loops_go_when_the_bound_is_reached() {
     assert_eq!((counts.offered, counts.dropped, counts.written), (20_001, 0, 20_001));
     drop(log);
     // A smaller bound takes effect with the next write.
-    let log = CycleLog::open_bounded(&store, bound / 4).unwrap();
+    let log = CycleLog::open_bounded(&store, (bound / 4, u64::MAX)).unwrap();
     log.offer(record("busy", 1, 20_001));
     log.flush().unwrap();
     assert!(log.counts().bytes <= bound / 4);
@@ -245,7 +245,7 @@ fn a_bound_out_of_range_is_refused_in_words() {
     let dir = tempdir().unwrap();
     let store = Store::open(dir.path()).unwrap();
     for bytes in [0, 16 * MIB - 1, 65_536 * MIB + 1] {
-        let error = CycleLog::open(&store, bytes).unwrap_err();
+        let error = CycleLog::open(&store, bytes, u64::MAX).unwrap_err();
         assert!(matches!(error, Error::Size { .. }), "{error:?}");
         assert!(error.to_string().contains("bound of the log of cycles"), "{error}");
     }
@@ -352,4 +352,20 @@ proptest! {
         let expected: Vec<u64> = (total.saturating_sub(wanted) + 1..=total).collect();
         prop_assert_eq!(seqs(&log, &id, Window::Last(n), before), expected);
     }
+}
+
+#[test]
+fn cycles_older_than_they_are_kept_go() {
+    let dir = tempdir().unwrap();
+    let store = Store::open(dir.path()).unwrap();
+    // A record every 10 ms; kept for a second.
+    let log = CycleLog::open(&store, 16 * MIB, 1_000_000_000).unwrap();
+    for seq in 1..=500 {
+        log.offer(record("level-1", 1, seq));
+        if seq % 50 == 0 {
+            log.flush().unwrap();
+        }
+    }
+    let left = seqs(&log, &loop_id("level-1"), Window::Last(u64::MAX - 1), false);
+    assert_eq!((left.first(), left.last()), (Some(&351), Some(&500)));
 }

@@ -90,7 +90,7 @@ fn cycles_wait_for_the_disk_and_come_after_it() {
     let dir = tempdir().unwrap();
     let full = Arc::new(AtomicBool::new(false));
     let store = Store::open(dir.path()).unwrap();
-    let log = crate::CycleLog::open_with(&store, 1 << 24, || opener(&full)).unwrap();
+    let log = crate::CycleLog::open_with(&store, (1 << 24, u64::MAX), || opener(&full)).unwrap();
     let id = loop_id("level-1");
     let seqs = |log: &crate::CycleLog| {
         let mut cursor = log.read(&id, crate::Window::Last(100), false).unwrap();
@@ -117,7 +117,10 @@ fn cycles_wait_for_the_disk_and_come_after_it() {
     assert_eq!((log.counts().written, log.counts().dropped), (3, 0));
     assert!(log.counts().failed_writes >= 2);
     log.close().unwrap();
-    assert_eq!(seqs(&crate::CycleLog::open(&store, 1 << 24).unwrap()), [1, 2, 3]);
+    assert_eq!(
+        seqs(&crate::CycleLog::open(&store, 1 << 24, u64::MAX).unwrap()),
+        [1, 2, 3]
+    );
 }
 
 fn open(dir: &std::path::Path, full: &Arc<AtomicBool>) -> Store {
