@@ -186,7 +186,7 @@ function Frame() {
           <button type="button" class="plain" aria-label={`Colours: ${theme.value}. Change`} title={`Colours: ${theme.value}`} onClick={() => set_theme(theme.value === "system" ? "dark" : theme.value === "dark" ? "light" : "system")}>
             {theme.value === "dark" ? "☾" : theme.value === "light" ? "☀" : "◐"}
           </button>
-          <button type="button" class="plain who-button" aria-label={`Your name, for the record: ${who.value || "not given"}. Change`} title="your name, for the record" onClick={() => (naming.value = true)}>
+          <button type="button" class="plain who-button" aria-label={`${who.value || "no name"}: your name, for the record. Change`} title="your name, for the record" onClick={() => (naming.value = true)}>
             {who.value || "no name"}
           </button>
           <button type="button" class="plain" aria-label="Keys and help" onClick={() => (help.value = true)}>

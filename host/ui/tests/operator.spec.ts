@@ -71,7 +71,7 @@ test("an alarm is defined, comes, is acknowledged, shelved, told again and goes"
   // Shelving needs a reason, and an end.
   await expect(dialog.getByRole("button", { name: "Shelve" })).toBeDisabled();
   await dialog.getByLabel("Reason").fill("the tank is being filled");
-  await dialog.getByLabel("For", { exact: true }).selectOption("1 hour");
+  await dialog.getByRole("combobox", { name: "For", exact: true }).selectOption("1 hour");
   await dialog.getByRole("button", { name: "Shelve", exact: true }).click();
   await expect(dialog.getByText(/until .* by ann: the tank is being filled/)).toBeVisible();
   await dialog.getByRole("button", { name: "Close" }).click();
@@ -162,7 +162,7 @@ test("a forced point is said wherever it or its loop is shown, and freed", async
   await open(page, "");
   await expect(page.locator(".card", { hasText: "tank-4" })).toContainText("FORCED");
   await page.getByRole("link", { name: "tank-4", exact: true }).click();
-  await expect(page.getByRole("status").filter({ hasText: "pv is forced to 55.5" })).toContainText("by bob: loop check");
+  await expect(page.locator(".forced-banner").filter({ hasText: "pv is forced to 55.5" })).toContainText("by bob: loop check");
   await expect(page.getByRole("region", { name: "Operation" })).toContainText("FORCED");
   await page.getByRole("button", { name: `Free ${pv}` }).click();
   await expect(page.locator(".forced-banner")).toHaveCount(0);
@@ -284,7 +284,7 @@ test("what is changed stands in the audit trail, with before and after, and the 
   const { paths } = await ask<{ paths: Record<string, unknown> }>("/openapi.json");
   test.skip(!paths["/v1/audit"], "this host keeps no audit trail");
   await open(page, "loop/tank-3");
-  await page.getByRole("button", { name: /^Your name, for the record/ }).click();
+  await page.getByRole("button", { name: /your name, for the record/ }).click();
   await page.getByLabel("Your name, for the record").fill("Łucja");
   await page.getByRole("button", { name: "Done" }).click();
   const before = (await loop("tank-3")).setpoint;

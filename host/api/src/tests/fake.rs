@@ -11,7 +11,7 @@ use bumpless_core::{
     history::Series,
 };
 use bumpless_deploy::{
-    ApplyEnd, Call, CallEnd, Change, Check, CommandEnd, ComponentView, Counters, DrainEnd, DrainOrder, Error, Expect,
+    ApplyEnd, Call, CallEnd, Change, CommandEnd, ComponentView, Counters, DrainEnd, DrainOrder, Error, Expect,
     HealthView, HostView, Imported, LoopDraft, LoopView, PointView, Relabel, Stage, StageView, Upload,
 };
 use bumpless_deploy::{
@@ -28,6 +28,7 @@ use super::{
     alarms::alarms,
     candidates::{shadow, trial, trial_report},
     history::history,
+    hosts,
     rollouts::rollout,
 };
 use crate::cell::{Answer, Cell};
@@ -564,12 +565,8 @@ impl Cell for Fake {
 
     fn health(&self, host: HostId) -> Answer<HealthView> {
         let unwell = *self.unwell.lock().unwrap();
-        let checks = ["bus", "cell", "store", "service", "io"].map(|name| Check {
-            name: name.to_owned(),
-            good: unwell != Some(name),
-            text: if unwell == Some(name) { "it is not" } else { "it is" }.to_owned(),
-        });
-        self.answer(HealthView::new(host, 60_000, checks.to_vec()))
+        let checks = hosts::checks(unwell);
+        self.answer(HealthView::new(host, 60_000, checks))
     }
 
     fn here(&self) -> HostId {

@@ -1,9 +1,21 @@
 //! Hosts over HTTP: what an order to drain asks, and what cannot be asked.
 
 use axum::http::StatusCode;
+use bumpless_deploy::Check;
 use serde_json::json;
 
 use super::{Bench, get, send};
+
+/// What a host looks at of itself, with one thing that may be unwell.
+pub(super) fn checks(unwell: Option<&str>) -> Vec<Check> {
+    ["bus", "cell", "store", "service", "io"]
+        .map(|name| Check {
+            name: name.to_owned(),
+            good: unwell != Some(name),
+            text: if unwell == Some(name) { "it is not" } else { "it is" }.to_owned(),
+        })
+        .to_vec()
+}
 
 #[tokio::test]
 async fn orders_to_drain_arrive_with_what_was_said() {

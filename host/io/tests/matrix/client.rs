@@ -189,7 +189,9 @@ pub(crate) fn against(tool: &Tool) -> Row {
                 .map(|n| (format!("c{n}"), f64::from(u8::from((n + mode.len()) % 3 == 0))))
                 .collect();
             write("limits", 15, &coils);
-            write("15", 15, &named(&[("c1", 1.0), ("c2", 1.0), ("c3", 0.0)]));
+            // Only what differs is sent, so three neighbours are turned over.
+            let turned: Vec<_> = coils[1..4].iter().map(|(name, value)| (name.clone(), 1.0 - value)).collect();
+            write("15", 15, &turned);
         }
     }
     {
@@ -253,7 +255,8 @@ fn stranger(port: u16) -> Verdict {
         !matches!(said, Err(NoData::NeverRead))
     });
     match (ended, said) {
-        (Verdict::Good, Err(NoData::CommsLost | NoData::DeviceError(10 | 11))) => {
+        // Gateway codes by the standard; pymodbus calls it a failure of the device.
+        (Verdict::Good, Err(NoData::CommsLost | NoData::DeviceError(4 | 10 | 11))) => {
             let after_ns = ours.server.clock().now_ns();
             ours.until("the unit beside it", || {
                 let reading = ours.server.read_one(ours.index("h0"), ours.server.clock().now_ns());
