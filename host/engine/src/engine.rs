@@ -23,7 +23,7 @@ use crate::{
     error::brief,
     prepared::Core,
     profile::{INSPECTED_AT_ONCE, Maps, TRIAL_INSTANCES},
-    ticker::{Pace, Ticker},
+    ticker::{Calls, Ticker},
 };
 
 /// Instances that may be asked for: beyond it, memory is gone before.
@@ -80,15 +80,15 @@ impl Engine {
         let cache = cache_dir
             .map(|dir| Cache::open(dir, cache_key, limits.cached_max, &engine, profile))
             .transpose()?;
-        let pace = Pace::default();
+        let calls = Calls::default();
         let core = Core {
             linker: Core::linker(&engine)?,
             limits,
             places: Places::new(instances_max),
             trials: Places::new(TRIAL_INSTANCES),
             inspections: Turnstile::new(INSPECTED_AT_ONCE, "inspected"),
-            _ticker: Ticker::start(engine.clone(), pace.clone())?,
-            pace,
+            _ticker: Ticker::start(engine.clone(), calls.clone())?,
+            calls,
             engine,
         };
         Ok(Self(Arc::new(Shared {

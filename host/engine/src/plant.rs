@@ -8,10 +8,7 @@
 //! Engine::open_plant ──► PreparedPlant ── instantiate ──► PlantInstance: begin, then advance, advance, … ── trap ──► ended
 //! ```
 
-use std::{
-    sync::Arc,
-    time::{Duration, Instant},
-};
+use std::{sync::Arc, time::Duration};
 
 use bumpless_core::{Digest, Fault, LogLevel, ParameterSpec, limits::PARAMETERS_MAX, limits::PORTS_MAX};
 use wasmtime::{Store, component::Component};
@@ -24,8 +21,9 @@ use crate::{
     convert,
     error::brief,
     plant_bindings::{Plant, PlantPre, exports::bumpless::control::process as wit},
-    prepared::{Core, store},
+    prepared::{Core, nanos, store},
     sandbox::{Call, Sandbox, cut},
+    ticker::monotonic_ns,
 };
 
 /// Which way a plant's signal goes, seen from the plant.
@@ -237,15 +235,13 @@ impl std::fmt::Debug for PreparedPlant {
     }
 }
 
-fn ns(limit: Duration) -> u64 {
-    u64::try_from(limit.as_nanos()).unwrap_or(u64::MAX)
-}
-
 fn live(core: &Core, pre: &PlantPre<Sandbox>, limit: Duration) -> Result<(Store<Sandbox>, Plant), Error> {
-    let mut store = store(core, Arc::from([]), Instant::now() + limit);
+    let (now_ns, limit_ns) = (monotonic_ns(), nanos(limit));
+    let mut store = store(core, Arc::from([]), now_ns.saturating_add(limit_ns));
+    let _watched = core.calls.begin(now_ns, limit_ns);
     match pre.instantiate(&mut store) {
         Ok(guest) => Ok((store, guest)),
-        Err(error) => Err(Error::Instantiate(store.data().fault(&error, ns(limit)))),
+        Err(error) => Err(Error::Instantiate(store.data().fault(&error, nanos(limit)))),
     }
 }
 
@@ -255,9 +251,11 @@ fn describe(core: &Core, pre: &PlantPre<Sandbox>) -> Result<PlantInfo, Error> {
     let _turn = core.inspections.enter(limit * 8)?;
     let (mut store, guest) = live(core, pre, limit)?;
     store.data_mut().open(Call::Describe);
+    // The deadline of the making goes on: both together have the limit.
+    let _watched = core.calls.begin(monotonic_ns(), nanos(limit));
     match guest.bumpless_control_process().call_describe_plant(&mut store) {
         Ok(said) => Ok(info(said)),
-        Err(error) => Err(Error::Describe(store.data().fault(&error, ns(limit)))),
+        Err(error) => Err(Error::Describe(store.data().fault(&error, nanos(limit)))),
     }
 }
 
@@ -345,12 +343,12 @@ impl PlantInstance {
         let Some((store, guest)) = &mut self.live else {
             return Err(Fault::Failed("the plant has ended".to_owned()));
         };
-        self.prepared.core.pace.call(limit_ns);
-        store
-            .data_mut()
-            .set_deadline(Instant::now() + Duration::from_nanos(limit_ns), limit_ns);
+        let now_ns = monotonic_ns();
+        let watched = self.prepared.core.calls.begin(now_ns, limit_ns);
+        store.data_mut().set_deadline(now_ns.saturating_add(limit_ns), limit_ns);
         store.set_epoch_deadline(1);
         let said = run(store, guest);
+        drop(watched);
         for line in store.data_mut().take_log() {
             let plant = &self.prepared.info.name;
             match line.level {

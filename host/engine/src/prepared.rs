@@ -2,10 +2,7 @@
 //!
 //! Never: changes; another digest is another `Prepared`.
 
-use std::{
-    sync::Arc,
-    time::{Duration, Instant},
-};
+use std::{sync::Arc, time::Duration};
 
 use bumpless_core::{Descriptor, Digest, Fault};
 use wasmtime::{
@@ -21,7 +18,7 @@ use crate::{
     convert,
     error::brief,
     sandbox::{CALL_BYTES_MAX, Call, PortFace, Sandbox, Stop, faces},
-    ticker::{Pace, Ticker},
+    ticker::{Calls, Ticker, monotonic_ns},
 };
 
 /// What every component and instance of an engine shares. Declared so that the clock outlives all stores.
@@ -34,9 +31,9 @@ pub(crate) struct Core {
     pub(crate) trials: Places,
     /// As many at once as there are spare slots.
     pub(crate) inspections: Turnstile,
-    /// How finely the limits of calls cut time.
-    pub(crate) pace: Pace,
-    /// Never read: it ticks until the last user of the engine is gone.
+    /// Calls that run, watched by the ticker.
+    pub(crate) calls: Calls,
+    /// Never read: it looks after them until the last user of the engine is gone.
     pub(crate) _ticker: Ticker,
 }
 
@@ -118,7 +115,7 @@ impl Prepared {
         let place = self.core.places.take()?;
         let limit = self.core.limits.describe_time_max;
         let live = self
-            .make(Instant::now() + limit)
+            .make(monotonic_ns(), nanos(limit))
             .map_err(|failed| Error::Instantiate(failed.fault(limit)))?;
         Ok(Instance::new(Arc::clone(self), live, place))
     }
@@ -134,14 +131,14 @@ impl Prepared {
         })?;
         let limit = self.core.limits.describe_time_max;
         let live = self
-            .make(Instant::now() + limit)
+            .make(monotonic_ns(), nanos(limit))
             .map_err(|failed| Error::Instantiate(failed.fault(limit)))?;
         Ok(Instance::new(Arc::clone(self), live, place))
     }
 
-    /// A store with a guest in it, within the deadline.
-    pub(crate) fn make(&self, deadline: Instant) -> Result<Live, Failed> {
-        make(&self.core, &self.pre, Arc::clone(&self.ports), deadline)
+    /// A store with a guest in it, made within the limit from now on.
+    pub(crate) fn make(&self, now_ns: u64, limit_ns: u64) -> Result<Live, Failed> {
+        make(&self.core, &self.pre, Arc::clone(&self.ports), now_ns, limit_ns)
     }
 }
 
@@ -176,17 +173,21 @@ impl Failed {
     }
 
     pub(crate) fn fault(&self, limit: Duration) -> Fault {
-        self.sandbox
-            .fault(&self.error, u64::try_from(limit.as_nanos()).unwrap_or(u64::MAX))
+        self.sandbox.fault(&self.error, nanos(limit))
     }
 }
 
-/// A store within its bounds; whatever runs in it must be over at `deadline`.
-pub(crate) fn store(core: &Core, ports: Arc<[PortFace]>, deadline: Instant) -> Store<Sandbox> {
-    let mut store = Store::new(&core.engine, Sandbox::new(&core.limits, ports, deadline));
+/// A time in ns.
+pub(crate) fn nanos(time: Duration) -> u64 {
+    u64::try_from(time.as_nanos()).unwrap_or(u64::MAX)
+}
+
+/// A store within its bounds; whatever runs in it must be over at the deadline, in ns of [`monotonic_ns`].
+pub(crate) fn store(core: &Core, ports: Arc<[PortFace]>, deadline_ns: u64) -> Store<Sandbox> {
+    let mut store = Store::new(&core.engine, Sandbox::new(&core.limits, ports, deadline_ns));
     store.limiter(|sandbox| sandbox);
     store.set_hostcall_fuel(CALL_BYTES_MAX);
-    // The epoch is shared by all stores, so a tick only makes a store look at its own deadline.
+    // The epoch is shared by all stores, so a late call only makes a store look at its own deadline.
     store.epoch_deadline_callback(|mut context| {
         Ok(if context.data_mut().is_overdue() {
             UpdateDeadline::Interrupt
@@ -198,8 +199,15 @@ pub(crate) fn store(core: &Core, ports: Arc<[PortFace]>, deadline: Instant) -> S
     store
 }
 
-fn make(core: &Core, pre: &ControllerPre<Sandbox>, ports: Arc<[PortFace]>, deadline: Instant) -> Result<Live, Failed> {
-    let mut store = store(core, ports, deadline);
+fn make(
+    core: &Core,
+    pre: &ControllerPre<Sandbox>,
+    ports: Arc<[PortFace]>,
+    now_ns: u64,
+    limit_ns: u64,
+) -> Result<Live, Failed> {
+    let mut store = store(core, ports, now_ns.saturating_add(limit_ns));
+    let _watched = core.calls.begin(now_ns, limit_ns);
     match pre.instantiate(&mut store) {
         Ok(guest) => Ok(Live { store, guest }),
         Err(error) => Err(Failed {
@@ -213,9 +221,11 @@ fn make(core: &Core, pre: &ControllerPre<Sandbox>, ports: Arc<[PortFace]>, deadl
 fn describe(core: &Core, pre: &ControllerPre<Sandbox>) -> Result<Descriptor, Error> {
     let limit = core.limits.describe_time_max;
     let _turn = core.inspections.enter(limit * 8)?;
-    let deadline = Instant::now() + limit;
-    let mut live = make(core, pre, Arc::from([]), deadline).map_err(|failed| failed.at_first(limit))?;
+    let (now_ns, limit_ns) = (monotonic_ns(), nanos(limit));
+    let mut live = make(core, pre, Arc::from([]), now_ns, limit_ns).map_err(|failed| failed.at_first(limit))?;
     live.store.data_mut().open(Call::Describe);
+    // The deadline of the making goes on: both together have the limit.
+    let _watched = core.calls.begin(now_ns, limit_ns);
     match live.guest.bumpless_control_control().call_describe(&mut live.store) {
         Ok(said) => Ok(convert::descriptor(said)),
         Err(error) => {

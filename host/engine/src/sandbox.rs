@@ -10,7 +10,7 @@
 //!                              └ trap, overrun or stop: the store with its sandbox is dropped
 //! ```
 
-use std::{collections::VecDeque, sync::Arc, time::Instant};
+use std::{collections::VecDeque, sync::Arc};
 
 use bumpless_core::{
     AlarmChange, Cycle, Descriptor, Direction, Effects, Fault, Frame, LogLevel, LogLine, Message, Mode, Reading,
@@ -19,7 +19,7 @@ use bumpless_core::{
 use rustix::time::{ClockId, clock_gettime};
 use wasmtime::{ResourceLimiter, Trap, WasmBacktrace};
 
-use crate::config::Limits;
+use crate::{config::Limits, ticker::monotonic_ns};
 
 /// Core instances, memories and tables of one component. A Rust component has 3, 1 and 2; composed ones have more.
 pub(crate) const CORE_INSTANCES_MAX: usize = 8;
@@ -67,8 +67,8 @@ pub(crate) struct Sandbox {
     memory_bytes: usize,
     /// What the guest asked for and did not get, in bytes or elements.
     refused: Option<Refused>,
-    /// When the call must be over.
-    deadline: Instant,
+    /// When the call must be over, in ns of [`monotonic_ns`].
+    deadline_ns: u64,
     /// Processor time of its own that the call may still use after that, in ns.
     own_time_ns: u64,
     /// The thread's own processor time when the deadline was first seen to have passed, in ns.
@@ -88,7 +88,7 @@ pub(crate) struct Sandbox {
 }
 
 /// Processor time that a guest may still use after its deadline, in ns, least and most: a quarter of its limit, and no more
-/// than half a coarse tick, so that on an idle machine it is stopped at the second tick after the deadline.
+/// than half a millisecond.
 const OWN_TIME_NS: (u64, u64) = (50_000, 500_000);
 
 /// Processor time of this thread, in ns.
@@ -121,13 +121,13 @@ const NO_CYCLE: Cycle = Cycle {
 };
 
 impl Sandbox {
-    pub(crate) fn new(limits: &Limits, ports: Arc<[PortFace]>, deadline: Instant) -> Self {
+    pub(crate) fn new(limits: &Limits, ports: Arc<[PortFace]>, deadline_ns: u64) -> Self {
         Self {
             memory_bytes_max: limits.memory_bytes_max,
             table_elements_max: limits.table_elements_max,
             memory_bytes: 0,
             refused: None,
-            deadline,
+            deadline_ns,
             own_time_ns: OWN_TIME_NS.1,
             late_from_ns: None,
             call: Call::Describe,
@@ -150,8 +150,8 @@ impl Sandbox {
     }
 
     /// When the next call must be over, and its limit in ns.
-    pub(crate) fn set_deadline(&mut self, deadline: Instant, limit_ns: u64) {
-        self.deadline = deadline;
+    pub(crate) fn set_deadline(&mut self, deadline_ns: u64, limit_ns: u64) {
+        self.deadline_ns = deadline_ns;
         self.own_time_ns = (limit_ns / 4).clamp(OWN_TIME_NS.0, OWN_TIME_NS.1);
         self.late_from_ns = None;
     }
@@ -160,7 +160,7 @@ impl Sandbox {
     /// its share of [`OWN_TIME_NS`] of processor time: a guest that was held up by other work of the machine, and is about to end, is
     /// late but not at fault. Costs nothing before the deadline, where all honest steps end.
     pub(crate) fn is_overdue(&mut self) -> bool {
-        if Instant::now() < self.deadline {
+        if monotonic_ns() < self.deadline_ns {
             return false;
         }
         let used_ns = thread_time_ns();
@@ -325,7 +325,7 @@ mod tests {
     use super::*;
 
     fn sandbox() -> Sandbox {
-        Sandbox::new(&Limits::default(), Arc::from([]), Instant::now())
+        Sandbox::new(&Limits::default(), Arc::from([]), monotonic_ns())
     }
 
     #[test]

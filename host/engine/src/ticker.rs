@@ -1,18 +1,23 @@
-//! The clock of the engine's epochs: one thread that advances them at absolute times, every millisecond, and eight times as
-//! often while calls have limits that a millisecond is too coarse for.
+//! The watch over running calls: one thread that advances the engine's epoch when a call has run past its deadline.
 //!
 //! ```text
-//!   coarse (1 ms) ── a call with a limit under 2 ms ──► fine (125 µs) ── none for a second ──► coarse
-//! ```
+//!   call begins: its deadline stands in its thread's seat ──► guest runs ──► call ends: the seat is empty
 //!
-//! Owns: that thread, from creation to its end on drop (at most one tick later).
-//! Never: decides that a step has taken too long; each store compares its own deadline when a tick reaches it.
+//!   the thread:  look ── nobody late ──► sleep until the next deadline that stands there, at most the shortest limit
+//!                  ▲ └── somebody late ──► advance the epoch ──► sleep 125 µs ──┐
+//!                  └────────────────────────────────────────────────────────────┘
+//! ```
+//! A call that begins after a look is seen at the next one, at the latest when its limit is over: so looking as often as the
+//! shortest limit keeps every limit exactly, and a loop at 1 kHz costs two looks per cycle and not eight.
+//!
+//! Owns: that thread, from creation to its end on drop (at most one look later), and the seats.
+//! Never: decides that a step has taken too long; each store compares its own deadline when the epoch reaches it.
 
 use std::{
     num::NonZeroU64,
     sync::{
         Arc,
-        atomic::{AtomicBool, AtomicU64, Ordering},
+        atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering},
     },
     thread::JoinHandle,
 };
@@ -24,45 +29,158 @@ use rustix::{
 
 use crate::Error;
 
-/// Time between ticks, in ns: a limit is kept to within two ticks, and the thread costs well under 1 % of a core.
-const COARSE_NS: i64 = 1_000_000;
-/// The same while fast loops run: a loop at 1 kHz must know within its period that a step spins. Costs 2 to 3 % of a core.
-const FINE_NS: i64 = 125_000;
-/// Calls with a shorter limit than this need fine ticks, in ns.
-const FAST_LIMIT_NS: u64 = 2_000_000;
-/// Fine ticks last for so long after the last such call, in ns.
-const FINE_FOR_NS: u64 = 1_000_000_000;
+/// Longest time between looks, in ns: who begins with a short limit after a pause waits this long at most.
+const LOOK_MAX_NS: u64 = 2_000_000;
+/// Shortest time between looks, and between ticks while a call is late, in ns: a loop at 1 kHz must know within its period
+/// that a step spins.
+const LOOK_MIN_NS: u64 = 125_000;
+/// A short limit is looked after for so long after the last call that had it, in ns.
+const SHORT_FOR_NS: u64 = 1_000_000_000;
+/// Threads with a seat of their own. Calls of further ones are not seen: while there are any, every look is a tick.
+const SEATS: usize = 64;
 
-/// How finely time is to be cut; told by calls, read by the ticker.
-#[derive(Debug, Clone, Default)]
-pub(crate) struct Pace(Arc<AtomicU64>);
+/// Nobody sits here.
+const EMPTY: u64 = 0;
 
-impl Pace {
-    /// A call with this limit begins. Nearly always one load and nothing more.
-    pub(crate) fn call(&self, limit_ns: u64) {
-        if limit_ns < FAST_LIMIT_NS {
-            let until_ns = monotonic_ns() + FINE_FOR_NS;
-            // Only now and then, so that the threads of fast loops do not fight for the line.
-            if self.0.load(Ordering::Relaxed) + FINE_FOR_NS / 2 < until_ns {
-                self.0.store(until_ns, Ordering::Relaxed);
+/// Which seats of the process are taken, a bit each.
+static TAKEN: AtomicU64 = AtomicU64::new(0);
+
+/// A thread's seat, the same in every engine; given back when the thread ends.
+struct Seat(Option<usize>);
+
+impl Seat {
+    fn take() -> Self {
+        let mut taken = TAKEN.load(Ordering::Relaxed);
+        loop {
+            let free = taken.trailing_ones();
+            if free as usize >= SEATS {
+                return Self(None);
             }
-        }
-    }
-
-    fn tick_ns(&self) -> i64 {
-        // Without fast loops there is no need to look at the clock.
-        match self.0.load(Ordering::Relaxed) {
-            0 => COARSE_NS,
-            until_ns if until_ns > monotonic_ns() => FINE_NS,
-            _ => {
-                self.0.store(0, Ordering::Relaxed);
-                COARSE_NS
+            match TAKEN.compare_exchange_weak(taken, taken | 1 << free, Ordering::Relaxed, Ordering::Relaxed) {
+                Ok(_) => return Self(Some(free as usize)),
+                Err(now) => taken = now,
             }
         }
     }
 }
 
-fn monotonic_ns() -> u64 {
+impl Drop for Seat {
+    fn drop(&mut self) {
+        if let Some(seat) = self.0 {
+            TAKEN.fetch_and(!(1 << seat), Ordering::Relaxed);
+        }
+    }
+}
+
+thread_local! {
+    static SEAT: Seat = Seat::take();
+}
+
+/// A seat's deadline on a line of its own, so that threads do not fight for it.
+#[derive(Debug, Default)]
+#[repr(align(64))]
+struct Deadline(AtomicU64);
+
+/// Calls that run, as the watching thread sees them. Cheap to clone.
+#[derive(Debug, Clone)]
+pub(crate) struct Calls(Arc<Seen>);
+
+#[derive(Debug)]
+struct Seen {
+    seats: [Deadline; SEATS],
+    /// Calls of threads without a seat.
+    unseen: AtomicUsize,
+    /// Time between looks, in ns.
+    look_ns: AtomicU64,
+    /// Until when that is needed, in ns of the monotonic clock.
+    look_until_ns: AtomicU64,
+}
+
+impl Default for Calls {
+    fn default() -> Self {
+        Self(Arc::new(Seen {
+            seats: std::array::from_fn(|_| Deadline::default()),
+            unseen: AtomicUsize::new(0),
+            look_ns: AtomicU64::new(LOOK_MAX_NS),
+            look_until_ns: AtomicU64::new(0),
+        }))
+    }
+}
+
+/// A call that is watched until this is dropped.
+#[derive(Debug)]
+pub(crate) struct Watched<'a> {
+    seen: &'a Seen,
+    seat: Option<usize>,
+    outer_ns: u64,
+}
+
+impl Drop for Watched<'_> {
+    fn drop(&mut self) {
+        match self.seat.and_then(|seat| self.seen.seats.get(seat)) {
+            Some(deadline) => {
+                deadline.0.store(self.outer_ns, Ordering::Relaxed);
+            }
+            None => {
+                self.seen.unseen.fetch_sub(1, Ordering::Relaxed);
+            }
+        }
+    }
+}
+
+impl Calls {
+    /// A call begins now that must be over after `limit_ns`. Nearly always a handful of loads and stores.
+    pub(crate) fn begin(&self, now_ns: u64, limit_ns: u64) -> Watched<'_> {
+        let seen = &*self.0;
+        let wish_ns = limit_ns.clamp(LOOK_MIN_NS, LOOK_MAX_NS);
+        let look_ns = seen.look_ns.load(Ordering::Relaxed);
+        if wish_ns < look_ns {
+            seen.look_ns.store(wish_ns, Ordering::Relaxed);
+        }
+        // Only now and then, so that the threads of fast loops do not fight for the line.
+        if wish_ns <= look_ns && seen.look_until_ns.load(Ordering::Relaxed) < now_ns + SHORT_FOR_NS / 2 {
+            seen.look_until_ns.store(now_ns + SHORT_FOR_NS, Ordering::Relaxed);
+        }
+        // A thread that ends has no seat any more.
+        let seat = SEAT.try_with(|seat| seat.0).ok().flatten();
+        let mut outer_ns = EMPTY;
+        match seat.and_then(|seat| seen.seats.get(seat)) {
+            Some(deadline) => {
+                // Only this thread writes here: what stands there is a call that this one is within, and it is put back.
+                outer_ns = deadline.0.load(Ordering::Relaxed);
+                deadline.0.store(now_ns.saturating_add(limit_ns), Ordering::Relaxed);
+            }
+            None => {
+                seen.unseen.fetch_add(1, Ordering::Relaxed);
+            }
+        }
+        Watched { seen, seat, outer_ns }
+    }
+
+    /// Looks at all calls: is one late, and when is the next look?
+    fn look(&self, now_ns: u64) -> (bool, u64) {
+        let seen = &*self.0;
+        if seen.look_until_ns.load(Ordering::Relaxed) < now_ns {
+            seen.look_ns.store(LOOK_MAX_NS, Ordering::Relaxed);
+        }
+        let look_ns = seen.look_ns.load(Ordering::Relaxed);
+        let first_ns = seen
+            .seats
+            .iter()
+            .map(|seat| seat.0.load(Ordering::Relaxed))
+            .filter(|deadline_ns| *deadline_ns != EMPTY)
+            .min();
+        let is_late = first_ns.is_some_and(|first_ns| first_ns <= now_ns);
+        if is_late {
+            return (true, now_ns + LOOK_MIN_NS);
+        }
+        let next_ns = first_ns.map_or(now_ns + look_ns, |first_ns| first_ns.min(now_ns + look_ns));
+        (seen.unseen.load(Ordering::Relaxed) > 0, next_ns)
+    }
+}
+
+/// Now, in ns of the clock that deadlines are told by.
+pub(crate) fn monotonic_ns() -> u64 {
     let now = clock_gettime(ClockId::Monotonic);
     let (seconds, ns) = (u64::try_from(now.tv_sec), u64::try_from(now.tv_nsec));
     seconds
@@ -79,13 +197,13 @@ pub(crate) struct Ticker {
 
 impl Ticker {
     /// Starts the thread.
-    pub(crate) fn start(engine: wasmtime::Engine, pace: Pace) -> Result<Self, Error> {
+    pub(crate) fn start(engine: wasmtime::Engine, calls: Calls) -> Result<Self, Error> {
         let stop = Arc::new(AtomicBool::new(false));
         let stopped = Arc::clone(&stop);
         let thread = std::thread::Builder::new()
             .name("bl-epoch".to_owned())
             .stack_size(256 * 1024)
-            .spawn(move || run(&engine, &pace, &stopped))
+            .spawn(move || run(&engine, &calls, &stopped))
             .map_err(Error::Thread)?;
         Ok(Self {
             stop,
@@ -104,40 +222,30 @@ impl Drop for Ticker {
     }
 }
 
-fn run(engine: &wasmtime::Engine, pace: &Pace, stop: &AtomicBool) {
-    // Both are wishes: without them a tick comes some 50 µs, under load some ms, later, and nothing else changes.
+fn run(engine: &wasmtime::Engine, calls: &Calls, stop: &AtomicBool) {
+    // Both are wishes: without them a look comes some 50 µs, under load some ms, later, and nothing else changes.
     if let Err(error) = set_current_timer_slack(NonZeroU64::new(1)) {
         tracing::debug!(%error, "timer slack of the epoch thread stays as it is");
     }
     if let Err(error) = rustix::process::setpriority_process(None, -15) {
         tracing::debug!(%error, "priority of the epoch thread stays as it is");
     }
-    let mut next = clock_gettime(ClockId::Monotonic);
     while !stop.load(Ordering::Relaxed) {
-        let now = clock_gettime(ClockId::Monotonic);
-        // After a suspension the lost ticks are skipped: one tick is enough to make every store look at its deadline.
-        next = later(plus(next, pace.tick_ns()), now);
-        if let Err(error) = clock_nanosleep_absolute(ClockId::Monotonic, &next) {
-            // A tick that comes early is harmless.
-            tracing::trace!(%error, "a tick was interrupted");
+        let (is_late, next_ns) = calls.look(monotonic_ns());
+        if is_late {
+            engine.increment_epoch();
         }
-        engine.increment_epoch();
+        if let Err(error) = clock_nanosleep_absolute(ClockId::Monotonic, &at(next_ns)) {
+            // A look that comes early is harmless.
+            tracing::trace!(%error, "a look was interrupted");
+        }
     }
 }
 
-fn plus(t: Timespec, tick_ns: i64) -> Timespec {
-    let ns = t.tv_nsec + tick_ns;
+fn at(ns: u64) -> Timespec {
     Timespec {
-        tv_sec: t.tv_sec + ns / 1_000_000_000,
-        tv_nsec: ns % 1_000_000_000,
-    }
-}
-
-fn later(a: Timespec, b: Timespec) -> Timespec {
-    if (a.tv_sec, a.tv_nsec) >= (b.tv_sec, b.tv_nsec) {
-        a
-    } else {
-        b
+        tv_sec: i64::try_from(ns / 1_000_000_000).unwrap_or(i64::MAX),
+        tv_nsec: i64::try_from(ns % 1_000_000_000).unwrap_or(0),
     }
 }
 
@@ -145,33 +253,53 @@ fn later(a: Timespec, b: Timespec) -> Timespec {
 mod tests {
     use super::*;
 
+    const T: u64 = 10_000_000_000;
+
     #[test]
-    fn ticks_carry_into_seconds() {
-        let half = Timespec {
-            tv_sec: 4,
-            tv_nsec: 999_500_000,
-        };
-        let t = plus(half, COARSE_NS);
-        assert_eq!((t.tv_sec, t.tv_nsec), (5, 500_000));
-        let early = Timespec { tv_sec: 4, tv_nsec: 0 };
-        assert_eq!(later(early, t).tv_sec, 5);
-        assert_eq!(later(t, early).tv_sec, 5);
+    fn the_next_look_is_at_the_first_deadline_or_after_the_shortest_limit() {
+        let calls = Calls::default();
+        assert_eq!(calls.look(T), (false, T + LOOK_MAX_NS));
+        let slow = calls.begin(T, 50_000_000);
+        assert_eq!(calls.look(T), (false, T + LOOK_MAX_NS));
+        assert_eq!(calls.look(T + 49_000_000), (false, T + 50_000_000));
+        assert_eq!(calls.look(T + 50_000_000), (true, T + 50_000_000 + LOOK_MIN_NS));
+        drop(slow);
+        assert!(!calls.look(T + 50_000_000).0);
+
+        let fast = calls.begin(T, 500_000);
+        drop(fast);
+        assert_eq!(calls.look(T), (false, T + 500_000));
+        // The short limit is forgotten once nobody had it for a second.
+        let later = T + SHORT_FOR_NS + 1;
+        assert_eq!(calls.look(later), (false, later + LOOK_MAX_NS));
     }
 
     #[test]
-    fn only_short_limits_make_ticks_fine_and_only_for_a_while() {
-        let pace = Pace::default();
-        pace.call(FAST_LIMIT_NS);
-        assert_eq!(pace.tick_ns(), COARSE_NS);
-        pace.call(FAST_LIMIT_NS - 1);
-        assert_eq!(pace.tick_ns(), FINE_NS);
-        // As if the second had passed.
-        pace.0.store(1, Ordering::Relaxed);
-        assert_eq!(pace.tick_ns(), COARSE_NS);
-        assert_eq!(
-            pace.0.load(Ordering::Relaxed),
-            0,
-            "the clock is left alone until the next short limit"
-        );
+    fn a_call_within_a_call_leaves_the_outer_one_watched() {
+        let calls = Calls::default();
+        let outer = calls.begin(T, 1_000_000);
+        let inner = calls.begin(T, 5_000_000);
+        drop(inner);
+        assert!(calls.look(T + 1_000_000).0);
+        drop(outer);
+        assert!(!calls.look(T + 1_000_000).0);
+    }
+
+    #[test]
+    fn calls_beyond_the_seats_make_every_look_a_tick() {
+        let calls = Calls::default();
+        let seats: Vec<Seat> = std::iter::repeat_with(Seat::take)
+            .take_while(|seat| seat.0.is_some())
+            .collect();
+        std::thread::scope(|scope| {
+            scope.spawn(|| {
+                let call = calls.begin(T, 50_000_000);
+                assert!(call.seat.is_none() && calls.look(T).0);
+                drop(call);
+                assert!(!calls.look(T).0);
+            });
+        });
+        drop(seats);
+        assert!(Seat::take().0.is_some());
     }
 }

@@ -42,11 +42,11 @@ mod store;
 mod writer;
 
 pub use alarms::ALARM_CHANGES_MAX;
-pub use audit::{AUDIT_BYTES_MAX, AuditBegun, AuditFound, AuditHead, AuditLog, Overdue};
 pub use archive::{
     Archive, ArchiveCounts, BYTES_MAX as HISTORY_BYTES_MAX, Bounds, Judge, Lens, ROWS_MAX as HISTORY_ROWS_MAX, Reading,
     RowBlock, pack_rows, unpack_rows,
 };
+pub use audit::{AUDIT_BYTES_MAX, AuditBegun, AuditFound, AuditHead, AuditLog, Overdue};
 pub use cycles::{BYTES_MAX as CYCLE_BYTES_MAX, Cursor, CycleCounts, CycleLog, Window};
 pub use error::Error;
 pub use intents::Tombstone;

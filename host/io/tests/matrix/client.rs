@@ -190,7 +190,10 @@ pub(crate) fn against(tool: &Tool) -> Row {
                 .collect();
             write("limits", 15, &coils);
             // Only what differs is sent, so three neighbours are turned over.
-            let turned: Vec<_> = coils[1..4].iter().map(|(name, value)| (name.clone(), 1.0 - value)).collect();
+            let turned: Vec<_> = coils[1..4]
+                .iter()
+                .map(|(name, value)| (name.clone(), 1.0 - value))
+                .collect();
             write("15", 15, &turned);
         }
     }
