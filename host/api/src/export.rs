@@ -228,6 +228,8 @@ fn values(rows: &[Row], sources: &[Source]) -> Vec<Values> {
 mod tests {
     #![allow(clippy::unwrap_used, reason = "tests")]
 
+    use std::sync::Arc;
+
     use bumpless_core::history::{Layout, Seen};
 
     use super::*;

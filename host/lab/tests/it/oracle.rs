@@ -97,7 +97,6 @@ const KNOWN: [Known; 7] = [
 fn text(known: &Known, component: &str) -> String {
     // A period of 1 ms and more.
     let scale = (1e-3 / known.step).max(1.0);
-    let period_ms = known.step * scale * 1e3;
     let plant = known
         .plant
         .split_inclusive([',', '[', ']', ' '])
