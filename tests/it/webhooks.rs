@@ -13,12 +13,15 @@ use std::{
 use bumpless_tests::{Api, Binary, Cell, CellOptions, wait_until};
 use serde_json::{Value, json};
 
+/// A body that was taken, its signature, and its bytes.
+type Taken = (Value, String, Vec<u8>);
+
 /// A receiver of a few lines. While it is shut it takes connections and gives 503.
 struct Receiver {
     port: u16,
     shut: Arc<AtomicBool>,
     slow: Arc<AtomicBool>,
-    got: Arc<Mutex<Vec<(Value, String, Vec<u8>)>>>,
+    got: Arc<Mutex<Vec<Taken>>>,
 }
 
 impl Receiver {
@@ -37,7 +40,7 @@ impl Receiver {
         );
         std::thread::spawn(move || {
             for stream in listener.incoming().map_while(Result::ok) {
-                answer(stream, &shut, &slow, &got);
+                answer(&stream, &shut, &slow, &got);
             }
         });
         receiver
@@ -67,9 +70,9 @@ impl Receiver {
     }
 }
 
-fn answer(stream: TcpStream, shut: &AtomicBool, slow: &AtomicBool, got: &Mutex<Vec<(Value, String, Vec<u8>)>>) {
+fn answer(stream: &TcpStream, shut: &AtomicBool, slow: &AtomicBool, got: &Mutex<Vec<Taken>>) {
     stream.set_read_timeout(Some(Duration::from_secs(5))).unwrap();
-    let mut reader = BufReader::new(&stream);
+    let mut reader = BufReader::new(stream);
     let (mut length, mut signature) = (0, String::new());
     loop {
         let mut line = String::new();
@@ -106,7 +109,7 @@ fn answer(stream: TcpStream, shut: &AtomicBool, slow: &AtomicBool, got: &Mutex<V
         "204 No Content"
     };
     let _gone =
-        (&stream).write_all(format!("HTTP/1.1 {status}\r\ncontent-length: 0\r\nconnection: close\r\n\r\n").as_bytes());
+        (&*stream).write_all(format!("HTTP/1.1 {status}\r\ncontent-length: 0\r\nconnection: close\r\n\r\n").as_bytes());
 }
 
 fn hook(api: &Api) -> Value {

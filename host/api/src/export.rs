@@ -17,8 +17,11 @@ use crate::types::output;
 
 mod parquet;
 
+/// The name of a column, or its end, and what stands there.
+type Column<From, To> = (&'static str, fn(&From) -> To);
+
 /// Counts, by the names of their columns.
-const COUNTS: [(&str, fn(&Bucket) -> u64); 6] = [
+const COUNTS: [Column<Bucket, u64>; 6] = [
     ("cycles", |b| b.cycles),
     ("lost", |b| b.lost),
     ("late", |b| b.late),
@@ -28,7 +31,7 @@ const COUNTS: [(&str, fn(&Bucket) -> u64); 6] = [
 ];
 
 /// What is told of a spread, by the ends of the columns' names.
-const PARTS: [(&str, fn(&Spread) -> Option<f64>); 3] = [
+const PARTS: [Column<Spread, Option<f64>>; 3] = [
     ("min", Spread::least),
     ("max", Spread::greatest),
     ("mean", Spread::mean),

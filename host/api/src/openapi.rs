@@ -37,7 +37,7 @@ use crate::{
         field::start, field::jobs, field::job, field::cancel,
         health::livez, health::readyz, pages::metrics, pages::openapi,
     ),
-    components(schemas(Problem, types::Record, types::Hosts, types::LiveRows, types::Standing, types::FieldNews, types::LiveField, live::Form)),
+    components(schemas(Problem, types::Record, types::Hosts, types::LiveRows, types::Standing, types::FieldNews, types::LiveField, live::Form, audit::AuditFormat)),
     tags(
         (name = "components", description = "The library of control components"),
         (name = "loops", description = "Controllers bound to points"),

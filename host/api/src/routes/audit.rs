@@ -120,7 +120,7 @@ pub(crate) async fn verify(State(app): State<App>) -> Result<JsonAnswer<AuditVer
 /// How the trail is exported.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize, ToSchema)]
 #[serde(rename_all = "lowercase")]
-pub(crate) enum Format {
+pub(crate) enum AuditFormat {
     /// One entry a line, as it stands on the host's disk, with a seal at the end of each chain: for `bumpless audit verify FILE`.
     #[default]
     Jsonl,
@@ -135,7 +135,7 @@ pub(crate) enum Format {
 pub(crate) struct ExportQuery {
     /// `jsonl` where not given.
     #[serde(default)]
-    format: Format,
+    format: AuditFormat,
     /// Only the chain of this host; those of all that are there where not given.
     host: Option<String>,
     /// From the first entry that is not older than this on; written as for the list.
@@ -153,7 +153,7 @@ const COLUMNS: [&str; 16] = [
 /// One export under way.
 struct Export {
     app: App,
-    format: Format,
+    format: AuditFormat,
     from_ms: Option<u64>,
     to_ms: Option<u64>,
     hosts: VecDeque<HostId>,
@@ -218,7 +218,7 @@ impl Export {
         let mut piece = Vec::new();
         if !self.begun {
             self.begun = true;
-            if self.format == Format::Csv {
+            if self.format == AuditFormat::Csv {
                 piece = table(std::iter::once(COLUMNS.iter().map(|name| (*name).to_owned()).collect()))?;
             }
         }
@@ -249,8 +249,8 @@ impl Export {
             }
             self.next = page.next;
             match self.format {
-                Format::Csv => piece.extend(table(lines.iter().filter_map(|line| row(line)))?),
-                Format::Jsonl => {
+                AuditFormat::Csv => piece.extend(table(lines.iter().filter_map(|line| row(line)))?),
+                AuditFormat::Jsonl => {
                     for line in &lines {
                         piece.extend_from_slice(line.as_bytes());
                         piece.push(b'\n');
@@ -262,7 +262,7 @@ impl Export {
                     .ends
                     .take()
                     .and_then(|(first, last)| Deploy::audit_seal(&host, &first, &last));
-                if let (Some(seal), Format::Jsonl) = (seal, self.format) {
+                if let (Some(seal), AuditFormat::Jsonl) = (seal, self.format) {
                     piece.extend_from_slice(seal.as_bytes());
                     piece.push(b'\n');
                 }
@@ -317,8 +317,8 @@ pub(crate) async fn export(State(app): State<App>, InQuery(query): InQuery<Expor
         }
     });
     let (kind, name) = match query.format {
-        Format::Jsonl => ("application/x-ndjson", "attachment; filename=\"audit.jsonl\""),
-        Format::Csv => ("text/csv; charset=utf-8", "attachment; filename=\"audit.csv\""),
+        AuditFormat::Jsonl => ("application/x-ndjson", "attachment; filename=\"audit.jsonl\""),
+        AuditFormat::Csv => ("text/csv; charset=utf-8", "attachment; filename=\"audit.csv\""),
     };
     let headers = [(header::CONTENT_TYPE, kind), (header::CONTENT_DISPOSITION, name)];
     Ok((headers, Body::from_stream(pieces)).into_response())

@@ -81,7 +81,7 @@ async fn answer(app: App, series: Series, query: &HistoryQuery, headers: &Header
     match file_kind(query.format.as_deref(), headers)? {
         None => {
             let view = app.cell.history(series.clone(), question).await?;
-            Ok(JsonAnswer(History::new(&series, view)).into_response())
+            Ok(JsonAnswer(History::new(&series, &view)).into_response())
         }
         Some(kind) => export(app, series, question, kind).await,
     }

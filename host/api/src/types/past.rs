@@ -124,7 +124,7 @@ pub(crate) fn output_names(rows: &[Row]) -> BTreeSet<String> {
 
 impl History {
     /// The answer's form over HTTP.
-    pub(crate) fn new(series: &Series, view: HistoryView) -> Self {
+    pub(crate) fn new(series: &Series, view: &HistoryView) -> Self {
         let us = |ns: u64| ns / 1_000;
         let ms = |ns: u64| ns as f64 / 1e6;
         let (loop_name, point) = match series {

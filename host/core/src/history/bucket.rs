@@ -136,7 +136,7 @@ impl<'a> Seen<'a> {
         Self {
             at_ns: record.at_ns,
             setpoint: record.setpoint,
-            measurement: reading.map(|reading| reading.value_or_last()),
+            measurement: reading.map(super::super::reading::Reading::value_or_last),
             bad: reading.is_some_and(|reading| reading.quality == Quality::Bad),
             outputs: &record.outputs,
             lost,

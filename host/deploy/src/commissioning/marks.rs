@@ -212,7 +212,7 @@ impl Room {
                     self.commissioning.forces.marks.lock().told.insert(host, generation);
                 }
                 Err(error) => {
-                    tracing::debug!(%host, %error, "the other master was not told of the forces; it is tried again")
+                    tracing::debug!(%host, %error, "the other master was not told of the forces; it is tried again");
                 }
             }
         };
