@@ -9,7 +9,7 @@ use std::sync::Arc;
 
 use bumpless_core::{
     Applied, Command, CommandBody, CommandId, HostId, LoopSpec, Outcome, Record,
-    desk::{Desk, Dispatch, Queued, Tally},
+    desk::{Desk, Dispatch, Queued, Tally, terms_passed_over},
     place,
     protocol::{Answer, Refusal},
 };
@@ -98,7 +98,15 @@ impl World {
         };
         let phase_ns = place::phase_ns(&spec.id, spec.period_ns);
         let begin = last.clone().filter(|_| broken != Some(Broken::TermsAgain));
-        l.desk = Some(Desk::new(host_id(home), spec, begin, local_ns, phase_ns));
+        let mut desk = Desk::new(host_id(home), spec, begin, local_ns, phase_ns);
+        if broken != Some(Broken::TermsAgain) {
+            let ahead = last.as_ref().map_or(0, |record| terms_passed_over(0, record.term));
+            let host = &mut self.hosts[home as usize];
+            desk.raise_terms(host.terms_set_aside);
+            host.terms_set_aside = host.terms_set_aside.max(ahead);
+        }
+        let l = &mut self.loops[number as usize];
+        l.desk = Some(desk);
         l.client.outstanding = None;
         self.note(number, || {
             format!("home h{home} opens from {:?}", last.as_ref().map(|r| r.position()))

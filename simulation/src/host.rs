@@ -101,6 +101,8 @@ pub(crate) struct Host {
     pub(crate) slow: u32,
     /// Faults that keep its disk from taking writes now.
     pub(crate) disk_full: u32,
+    /// Terms that it set aside, on a place of its disk that it has already.
+    pub(crate) terms_set_aside: u64,
     /// Faults that make its steps come out wrong now.
     pub(crate) bits: u32,
     pub(crate) clock: Clock,
@@ -128,6 +130,7 @@ impl Host {
             pauses: 0,
             slow: 0,
             disk_full: 0,
+            terms_set_aside: 0,
             bits: 0,
             clock,
             clock_next: None,

@@ -7,7 +7,11 @@
 
 use std::{collections::VecDeque, sync::Arc};
 
-use bumpless_core::{LoopSpec, Wiring, desk::Tally, place};
+use bumpless_core::{
+    LoopSpec, Wiring,
+    desk::{Tally, terms_passed_over},
+    place,
+};
 
 use crate::{
     Error,
@@ -454,7 +458,13 @@ impl World {
         let shift_ns = host.clock_next.take().unwrap_or_default();
         host.clock.local_ns = shifted(EPOCH_NS + now_ns, shift_ns);
         host.clock.since_ns = now_ns;
-        let life = host.life;
+        let (life, homes) = (host.life, host.homes.clone());
+        let on_disk = homes
+            .iter()
+            .filter_map(|number| self.loops[*number as usize].disk.as_ref());
+        let found = on_disk.map(|record| record.term).max().unwrap_or(0);
+        let host = self.host_mut(number);
+        host.terms_set_aside = terms_passed_over(host.terms_set_aside, found);
         self.queue.put(now_ns + GATHER_NS, Event::Reopen { host: number, life });
         let sync = Event::Sync {
             host: number,

@@ -37,6 +37,15 @@ const SUSPECT_NS_MAX: u64 = 60_000_000_000;
 /// time may be unknown afterwards: at most two for each cycle of 1 ms, and as many again for a disk that is slow.
 pub const TERMS_SKIPPED_AT_RESTART: u64 = 4096;
 
+/// Terms up to this one are passed over by a home in a new life: `set_aside` is what the life before passed over, `found` the
+/// greatest term of its records that is known. It must be set aside, durably, before the home opens: of two lives after each
+/// other neither may have brought a record anywhere, and they must not give out the same terms.
+#[must_use]
+pub const fn terms_passed_over(set_aside: u64, found: u64) -> u64 {
+    let known = if set_aside > found { set_aside } else { found };
+    known.saturating_add(TERMS_SKIPPED_AT_RESTART)
+}
+
 /// Counts since the home started.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Tally {

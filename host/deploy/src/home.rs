@@ -340,6 +340,7 @@ impl Room {
         // Looked at before the floor of the terms is: one that came meanwhile is noticed, and the home opened again.
         let mastery = self.mastery(&intent.current);
         let revision = self.home_revision(&intent.current).await?;
+        self.set_aside_terms(last.as_deref()).await;
         self.field
             .open_home(revision, last)
             .map_err(|error| Error::refused(crate::error::chain(&error), ""))?;

@@ -57,6 +57,7 @@ mod service;
 mod shadows;
 mod sync;
 mod telling;
+mod terms;
 mod trials;
 mod uploads;
 mod verdict;

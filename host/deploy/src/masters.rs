@@ -11,7 +11,7 @@
 
 use std::sync::Arc;
 
-use bumpless_core::{Intent, LoopSpec, PointId, desk::TERMS_SKIPPED_AT_RESTART};
+use bumpless_core::{Intent, LoopSpec, PointId};
 
 use crate::{error::Error, limits::TERMS_PER_EPOCH, room::Room};
 
@@ -58,9 +58,9 @@ impl Room {
     pub(crate) fn term_floor(&self, spec: &LoopSpec) -> u64 {
         match self.mastery(spec) {
             Mastery::Master(epoch) => u64::from(epoch).saturating_mul(TERMS_PER_EPOCH),
-            // A loop that an earlier life of this host had, and that left no record anywhere, must not begin with the same terms
-            // again: somebody may still hold a record of them. Where there is a record, the desk goes on from it.
-            Mastery::Alone | Mastery::Away if self.book.was_there(&spec.id) => TERMS_SKIPPED_AT_RESTART,
+            // A loop that an earlier life of this host had must not begin with the same terms again: somebody may still hold a
+            // record of them. Where there is a newer record, the desk goes on from it.
+            Mastery::Alone | Mastery::Away if self.book.was_there(&spec.id) => self.terms.floor(),
             Mastery::Alone | Mastery::Away => 0,
         }
     }

@@ -50,6 +50,7 @@ use crate::{
     self_watch::{HostAlarms, SelfWatch},
     shadows::Shadows,
     telling::LastTold,
+    terms::Terms,
     webhook::{self, WebhookConfig, Webhooks},
     wire::{self, Ask, Notice, Told},
 };
@@ -164,6 +165,7 @@ pub(crate) struct Room {
     pub(crate) shadows: Shadows,
     pub(crate) rollouts: Ledger,
     pub(crate) alarms: Alarms,
+    pub(crate) terms: Terms,
     pub(crate) audit: Audit,
     pub(crate) webhooks: Webhooks,
     pub(crate) self_watch: SelfWatch,
@@ -248,6 +250,8 @@ impl Room {
         writer.tell_on_disk(Box::new(move |id, position| told.kept(id, position).is_ok()));
         let (audit, found) = Audit::open(&store, &here, audit_bytes_max)?;
         let (webhooks, hooks) = webhook::ready(webhooks, &here)?;
+        let records = store.last_records()?;
+        let terms = Terms::begin(&store, &records);
         let book = Book::open(store.clone())?;
         let library = Library::open(store.clone())?;
         let room = Arc::new(Self {
@@ -255,6 +259,7 @@ impl Room {
             library,
             bench: Bench::new(engine),
             roster: Roster::new(own.clone()),
+            terms,
             feed: Feed::new(writer),
             cycles,
             archive,
@@ -293,7 +298,7 @@ impl Room {
             clock,
             field,
         });
-        for record in room.store.last_records()? {
+        for record in records {
             room.feed.remember(&Arc::new(record));
         }
         room.forget_strangers();

@@ -13,6 +13,7 @@
 //!   history/                 thinned history of loops and points, up to a bound
 //!   components/<digest>.wasm the bytes, named by what they are
 //!   secrets/<name>           0600, 32 random bytes
+//!   terms                    the greatest term of ownership that was set aside
 //! ```
 //!
 //! | what | durable when the call returns? | why |
@@ -39,6 +40,7 @@ mod records;
 mod rollouts;
 mod settings;
 mod store;
+mod terms;
 mod writer;
 
 pub use alarms::ALARM_CHANGES_MAX;

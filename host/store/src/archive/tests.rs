@@ -207,7 +207,7 @@ fn the_bound_holds_and_the_finest_goes_first() {
     let dir = tempdir().unwrap();
     let bounds = Bounds { bytes_max: MIB, ..KEEP };
     let archive = open_with(dir.path(), bounds, |_| {});
-    let cycles = 6_000;
+    let cycles = 18_000;
     for hour in 0..60_u64 {
         offer(&archive, "level-1", hour * cycles..(hour + 1) * cycles);
         archive.pack().unwrap();
