@@ -35,7 +35,7 @@ fn every_kind_of_change_leaves_its_entry() {
             .unwrap()
             .iter()
             .find(|p| p["written_by"].is_null() && p["writable"] == true)
-            .unwrap()["id"],
+            .unwrap()["name"],
     );
     let member = text(&api.loop_view(LOOP).unwrap()["members"][0]);
     // Method, path, body, what the entry says, and whether it is done.

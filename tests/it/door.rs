@@ -121,6 +121,7 @@ fn a_program_on_the_bus_gets_both_replies() {
         assert_eq!(again[0]["ack"]["state"], "done", "{again:?}");
     }
     // A definitive error is a reply too.
+    device.set_delay(Duration::ZERO);
     let words = client.ask("a", &json!({"start": {"bus": "line", "name": "never", "by": "scada"}}));
     let failed = client.told(&text(&words[0]["ack"]["id"]), "failed");
     assert!(text(&failed["told"]["reason"]).contains("did not come"), "{failed}");

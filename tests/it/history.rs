@@ -15,7 +15,8 @@ fn ask(api: &Api, what: &str, body: &Value) -> Value {
 
 /// Waits for so many records more.
 fn cycles_pass(api: &Api, count: u64) {
-    let seen = whole(&api.loop_view(LOOP).unwrap()["seq"]);
+    // Before its first record it has none.
+    let seen = api.loop_view(LOOP).unwrap()["seq"].as_u64().unwrap_or(0);
     api.wait_for_loop(LOOP, "further cycles", |view| {
         view["seq"].as_u64() >= Some(seen + count)
     })

@@ -365,10 +365,16 @@ pub fn conclude(c: Conclusion<'_>) -> Record {
                 }
             };
             // Where the policy moved an output away under a component that saw nothing, what the component remembers belongs to
-            // where the output was. It begins anew from the actuator when it sees again, so that the way back has no bump.
+            // where the output was; where it saw nothing for more than a cycle, to a process that has moved since. It begins
+            // anew from the actuator when it sees again, so that the way back has no bump.
             let moved = outputs.iter().zip(&held).any(|(o, h)| o.to_bits() != h.to_bits());
+            let again = base.is_some_and(|r| r.events.contains(&Event::PolicyHeld));
             let effects = Effects {
-                state: if bad_input && moved { Vec::new() } else { state.to_vec() },
+                state: if bad_input && (moved || again) {
+                    Vec::new()
+                } else {
+                    state.to_vec()
+                },
                 ..Effects::default()
             };
             (

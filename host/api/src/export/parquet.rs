@@ -117,14 +117,14 @@ impl File {
         for (name, kind) in &self.columns {
             column(&mut meta, name, *kind);
         }
-        meta.int(3, self.groups.iter().map(|(rows, _)| rows).sum());
+        meta.long(3, self.groups.iter().map(|(rows, _)| rows).sum());
         meta.list(4, STRUCT, self.groups.len());
         for (rows, chunks) in &self.groups {
             meta.element();
             meta.list(1, STRUCT, chunks.len());
             for (chunk, (name, kind)) in chunks.iter().zip(&self.columns) {
                 meta.element();
-                meta.int(2, chunk.at);
+                meta.long(2, chunk.at);
                 meta.open(3);
                 meta.int(1, kind.physical());
                 meta.list(2, I32, 2);

@@ -278,12 +278,19 @@ impl Export {
 #[utoipa::path(get, operation_id = "export_audit", path = "/v1/audit/export", tag = "audit",
     params(ExportQuery),
     responses(
-        (status = 200, description = "The lines of the chains, or a table", body = String, content_type = "application/x-ndjson"),
+        (status = 200, description = "The lines of the chains, or a table", content((String = "text/x-ndjson"), (String = "text/csv"))),
         (status = "default", description = "What went wrong", body = Problem, content_type = "application/problem+json")))]
 pub(crate) async fn export(State(app): State<App>, InQuery(query): InQuery<ExportQuery>) -> Result<Response, Problem> {
     let alive = || app.cell.hosts().into_iter().filter(|host| host.alive || host.here);
     let hosts: VecDeque<HostId> = match &query.host {
-        Some(name) => VecDeque::from([HostId::new(name)?]),
+        Some(name) => {
+            let host = HostId::new(name)?;
+            if !app.cell.hosts().iter().any(|known| known.id == host) {
+                let reason = format!("the cell has no host {host}");
+                return Err(Problem::new(Kind::NotFound, reason, "list the hosts for their names"));
+            }
+            VecDeque::from([host])
+        }
         None => alive().map(|host| host.id).collect(),
     };
     let mut export = Export {
@@ -317,7 +324,7 @@ pub(crate) async fn export(State(app): State<App>, InQuery(query): InQuery<Expor
         }
     });
     let (kind, name) = match query.format {
-        AuditFormat::Jsonl => ("application/x-ndjson", "attachment; filename=\"audit.jsonl\""),
+        AuditFormat::Jsonl => ("text/x-ndjson", "attachment; filename=\"audit.jsonl\""),
         AuditFormat::Csv => ("text/csv; charset=utf-8", "attachment; filename=\"audit.csv\""),
     };
     let headers = [(header::CONTENT_TYPE, kind), (header::CONTENT_DISPOSITION, name)];

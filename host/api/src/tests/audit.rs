@@ -186,7 +186,7 @@ async fn exported(bench: &Bench, query: &str) -> (String, String) {
 async fn an_export_is_what_stands_on_the_disk_and_can_be_verified_elsewhere() {
     let bench = Bench::new();
     let (kind, text) = exported(&bench, "").await;
-    assert_eq!(kind, "application/x-ndjson");
+    assert_eq!(kind, "text/x-ndjson");
     let mut checker = Checker::default();
     for line in text.lines() {
         checker.look(line).expect("it fits");

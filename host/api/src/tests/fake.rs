@@ -565,8 +565,7 @@ impl Cell for Fake {
 
     fn health(&self, host: HostId) -> Answer<HealthView> {
         let unwell = *self.unwell.lock().unwrap();
-        let checks = hosts::checks(unwell);
-        self.answer(HealthView::new(host, 60_000, checks))
+        self.answer(HealthView::new(host, 60_000, hosts::checks(unwell)))
     }
 
     fn here(&self) -> HostId {

@@ -305,6 +305,12 @@ fn the_way_back_from_a_bad_input_begins_at_the_actuator() {
             (outputs, keeps),
             "{policy:?}"
         );
+        // A cycle without sight is bridged; after more the process is elsewhere.
+        let mut blind = before();
+        blind.events = vec![Event::PolicyHeld];
+        let standing = settle(Some(&blind), &spec, &sample(vec![]), &[42.0]);
+        let record = conclude_with(Err(Fault::BadInput("pv".into())), standing, &blind, &spec);
+        assert!(record.state.is_empty(), "{policy:?}");
     }
 }
 
