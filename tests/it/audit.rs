@@ -20,6 +20,8 @@ fn cell() -> Cell {
     let api = cell.plant.api();
     api.upload_stock(&["pid", "pidplus", "on-off"]).unwrap();
     api.apply(&first_order_loop(0, "pid", 50.0)).unwrap();
+    // Before its first cycle nothing can be told of before.
+    api.wait_for_loop(LOOP, "a cycle", |view| view["seq"].is_u64()).unwrap();
     cell
 }
 
@@ -78,7 +80,7 @@ fn every_kind_of_change_leaves_its_entry() {
         (
             "POST",
             format!("{loop_path}/set"),
-            json!({ "parameters": { "k": 1.25 } }),
+            json!({ "parameters": { "ti": 9.5 } }),
             "loop.set",
             true,
         ),
@@ -269,7 +271,7 @@ fn every_kind_of_change_leaves_its_entry() {
     }
     for (what, field, before, after) in [
         ("loop.setpoint", "setpoint", json!(50.0), json!(42.0)),
-        ("loop.set", "parameters.k", Value::Null, json!(1.25)),
+        ("loop.set", "parameters.ti", Value::Null, json!(9.5)),
         ("loop.mode", "mode", json!("manual"), json!("automatic")),
         ("loop.swap", "component", json!("pid@"), json!("pidplus@")),
         ("component.relabel", "labels.stage", Value::Null, json!("pilot")),

@@ -4,9 +4,10 @@ use std::{
     fs::{self, File},
     path::PathBuf,
     process::{Command, Stdio},
+    time::{Duration, SystemTime, UNIX_EPOCH},
 };
 
-use bumpless_tests::{Api, Binary, Cell, CellOptions, first_order_loop, repository};
+use bumpless_tests::{Api, Binary, Cell, CellOptions, first_order_loop, repository, wait_until};
 use serde_json::Value;
 
 use crate::{names, whole};
@@ -65,6 +66,13 @@ fn what_the_home_lost_other_hosts_still_have_and_what_nobody_saw_is_a_gap() {
     let data = cell.plant.data();
     fs::remove_dir_all(data.join("history")).unwrap();
     fs::remove_file(data.join("cycles.redb")).unwrap();
+    // What nobody saw must be longer than a piece.
+    wait_until("a piece without a home", Duration::from_secs(30), || {
+        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap();
+        let since = now.saturating_sub(Duration::from_micros(died_us));
+        (since > Duration::from_secs(4)).then_some(()).ok_or(since)
+    })
+    .unwrap();
     cell.restart("plant").unwrap();
     cell.wait_joined().unwrap();
     let home = cell.plant.api();

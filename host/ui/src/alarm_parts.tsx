@@ -43,13 +43,16 @@ export function Bell() {
   const most = by_priority[0]?.[0] ?? "";
   return (
     <>
-      <a class={`bell ${waiting.length > 0 ? `waiting ${most}` : standing > 0 ? "seen" : "none"}`} href="#/alarms" aria-label={words} title={words}>
-        {by_priority.map(([priority, n]) => (
-          <span key={priority}>
-            <Prio priority={priority} label="" /> {n}
-          </span>
-        ))}
-        {waiting.length === 0 && (standing > 0 ? `${standing} seen` : "no alarms")}
+      <a class={`bell ${waiting.length > 0 ? `waiting ${most}` : standing > 0 ? "seen" : "none"}`} href="#/alarms" title={words}>
+        <span aria-hidden="true">
+          {by_priority.map(([priority, n]) => (
+            <span key={priority}>
+              <Prio priority={priority} label="" /> {n}
+            </span>
+          ))}
+          {waiting.length === 0 && (standing > 0 ? `${standing} seen` : "no alarms")}
+        </span>
+        <span class="hidden">{words}</span>
       </a>
       <span class="hidden" role="status">
         {words}
@@ -242,7 +245,7 @@ export function AlarmDialog(props: { loop: string; name: string; close: () => vo
       {past.length > 0 && (
         <details>
           <summary>What happened to it</summary>
-          <ol class="events">
+          <ol class="events" tabIndex={0}>
             {past.map((change) => (
               <li key={`${change.at_unix_us} ${change.what}`}>
                 <time>{when(change.at_unix_us / 1_000)}</time>
@@ -466,9 +469,10 @@ export function LoopAlarms({ loop }: { loop: string }) {
           const quiet = alarm.shelf ? "shelved" : alarm.out_of_service ? "out of service" : alarm.suppressed ? "suppressed" : "";
           return (
             <li key={alarm.name} class={alarm.state === "normal" || alarm.quiet ? "" : "on"}>
-              <button type="button" class="plain" aria-label={`${alarm.name}, ${alarm.priority} priority, ${STATE[alarm.state]}`} onClick={() => set_open(alarm.name)}>
+              <button type="button" class="plain" onClick={() => set_open(alarm.name)}>
                 <Prio priority={alarm.priority} seen={!is_unseen(alarm)} label="" />
-                <b>{alarm.name}</b>
+                <b aria-hidden="true">{alarm.name}</b>
+                <span class="hidden">{`${alarm.name}, ${alarm.priority} priority, ${STATE[alarm.state]}`}</span>
                 <span>
                   {alarm.definition.limit !== null && alarm.definition.limit !== undefined ? `${alarm.definition.kind} ${value(alarm.definition.limit, span)} ${unit}` : (KINDS[alarm.definition.kind] ?? alarm.definition.kind)}
                 </span>

@@ -539,7 +539,8 @@ function Happened({ loop }: { loop: string }) {
     <section class="panel" aria-label={`Events of ${loop}`}>
       <h2>Events</h2>
       {own.length === 0 && <None what="Nothing to tell." />}
-      <ol class="events">
+      {/* It scrolls, so the keyboard must reach it. */}
+      <ol class="events" tabIndex={0}>
         {own.map((notice) => (
           <li key={notice.number} class={notice.weight}>
             <time title={zone(notice.at_unix_us / 1_000)}>{clock(notice.at_unix_us / 1_000)}</time>

@@ -213,7 +213,7 @@ function One({ digest }: { digest: string }) {
         </Act>
       </form>
       <h3>History</h3>
-      <ol class="events">
+      <ol class="events" tabIndex={0}>
         {[...one.history].reverse().map((event) => (
           <li key={`${event.at_unix_ms}-${event.what}`}>
             <time title={zone(event.at_unix_ms)}>{when(event.at_unix_ms)}</time>
