@@ -269,7 +269,7 @@ function Entry({ line, close }: { line: AuditLine; close: () => void }) {
         </dd>
       </dl>
       {line.changes.length > 0 && (
-        <div class="scroll">
+        <div class="scroll" tabIndex={0} role="region" aria-label="Table of fields">
           <table class="list">
             <thead>
               <tr>

@@ -184,7 +184,7 @@ export function Hosts() {
         {owners.length === 0 ? (
           <None what="No cycles seen yet." />
         ) : (
-          <div class="scroll">
+          <div class="scroll" tabIndex={0} role="region" aria-label="Table of steps between hosts">
             <table class="matrix">
               <thead>
                 <tr>

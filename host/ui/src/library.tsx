@@ -78,7 +78,7 @@ export function Library(props: { digest: string }) {
         </div>
       )}
       <div class={props.digest ? "split" : ""}>
-        <div class="scroll">
+        <div class="scroll" tabIndex={0} role="region" aria-label="Table of components">
           <table class="list">
             <thead>
               <tr>

@@ -70,7 +70,7 @@ function One({ id }: { id: string }) {
         </h2>
         {one.state === "running" && <Act act={() => send("POST", `/v1/rollouts/${encodeURIComponent(id)}/stop`, {})}>Stop</Act>}
       </div>
-      <div class="scroll">
+      <div class="scroll" tabIndex={0} role="region" aria-label="Table of rollouts">
         <table class="list">
           <thead>
             <tr>
