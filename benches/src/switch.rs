@@ -1,5 +1,5 @@
-//! `swap --hz … --count … --kill`: hundreds of swaps on one fast loop, as fast as they come into force, with the owner killed at random moments if
-//! wanted; then components that go wrong on probation.
+//! `swap --hz … --count … --kill`: hundreds of swaps on one fast loop, ten a second or as fast as they come into force, with the
+//! owner killed at random moments if wanted; then components that go wrong on probation.
 //!
 //! ```text
 //! the same law, another component:   pid 0.1.0 ⇄ pid 0.1.1     the output must go on exactly
@@ -57,12 +57,15 @@ const SETTLE: Duration = Duration::from_secs(30);
 /// What is switched how. Without any of these `swap` runs its own plan.
 #[derive(Debug, Clone, Copy, Args)]
 pub(crate) struct Switching {
-    /// One loop at this rate, in Hz, swapped as fast as the swaps come into force; 1 to 1000, usually 1000, and 100 with kills.
+    /// One loop at this rate, in Hz; 1 to 1000, usually 1000, and 100 with kills.
     #[arg(long, value_parser = rate)]
     hz: Option<f64>,
     /// So many swaps of that loop, usually 500.
     #[arg(long)]
     count: Option<u64>,
+    /// Least time between two swaps, in ms; 0 for as fast as they come into force, which fills two small processors.
+    #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u64).range(0..=10_000))]
+    every_ms: u64,
     /// Kill that loop's owner again and again while it is swapped.
     #[arg(long)]
     kill: bool,
@@ -92,6 +95,11 @@ impl Switching {
     /// Do the replicas share the steps?
     fn is_shared(&self) -> bool {
         self.kill || self.hz() <= SHARED_HZ_MAX
+    }
+
+    /// Waits until the next swap may begin.
+    fn pause(&self, begun: Instant) {
+        std::thread::sleep(Duration::from_millis(self.every_ms).saturating_sub(begun.elapsed()));
     }
 
     fn period_ns(&self) -> u64 {
@@ -173,6 +181,7 @@ pub(crate) fn run(options: Options, switching: Switching, report: &mut Report) -
         if number % 8 == 0 {
             drop(api.setpoint(LOOP, if number % 16 == 0 { 60.0 } else { 40.0 }));
         }
+        let begun = Instant::now();
         let asked_ns = unix_ns();
         let end = api.swap(LOOP, to);
         asked.push(Asked {
@@ -187,6 +196,7 @@ pub(crate) fn run(options: Options, switching: Switching, report: &mut Report) -
                 last_refusal = error.to_string();
             }
         }
+        switching.pause(begun);
     }
     let (cell, kills_ns) = killer.finish()?;
     let after = Tally::ask(&api, LOOP)?;
@@ -205,6 +215,7 @@ pub(crate) fn run(options: Options, switching: Switching, report: &mut Report) -
         law::component_path(&format!("guests/{name}"))?;
         api.upload_guest(name)?;
         for _ in 0..MISDEEDS_EACH {
+            switching.pause(Instant::now());
             wrong.push(misdeed(&api, &history, switching, &pid, name, parameters)?);
         }
     }
@@ -215,6 +226,7 @@ pub(crate) fn run(options: Options, switching: Switching, report: &mut Report) -
     let journal = cell.journal()?;
 
     report.told("swap.rate", switching.hz(), "Hz");
+    report.told("swap.between_swaps", switching.every_ms as f64, "ms");
     let seen = history.between(LOOP, from_ns, to_ns);
     tell_kills(report, &kills_ns, &seen, &asked);
     report.told("swap.nothing_to_change", unchanged as f64, "swaps");
