@@ -59,6 +59,7 @@ pub(crate) fn run(options: Options, report: &mut Report) -> Result<(), Error> {
         })
     };
     all_members()?;
+    history.wait("the first record", 0, |_| true)?;
     let before = Tally::ask(&api, LOOP)?;
     let watch = Watch::start();
     let mut killed_ns = Vec::new();

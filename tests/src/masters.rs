@@ -142,6 +142,24 @@ impl TwoMasters {
                 .find(|write| write.master == host && write.at >= since);
             found.ok_or(last)
         })
+        .map_err(|error| self.with_what_the_hosts_say(error))
+    }
+
+    /// A wait that was in vain, with the ends of the hosts' logs.
+    fn with_what_the_hosts_say(&self, error: Error) -> Error {
+        match error {
+            Error::Waited { what, seconds, seen } => {
+                let logs: Vec<String> = self
+                    .hosts
+                    .iter()
+                    .enumerate()
+                    .map(|(number, host)| format!("io-{}:\n{}", number + 1, host.stderr_tail()))
+                    .collect();
+                let seen = format!("{seen}\n{}", logs.join("\n"));
+                Error::Waited { what, seconds, seen }
+            }
+            other => other,
+        }
     }
 
     fn wait_for<T, S: std::fmt::Debug>(&self, what: &str, ask: impl FnMut() -> Result<T, S>) -> Result<T, Error> {
