@@ -152,12 +152,7 @@ impl Cell {
             net.cut(number, 0)?;
         }
         for n in 0..cell.options.controllers {
-            let mut host = cell.spawn_controller(&controller_name(n))?;
-            if cell.options.net.is_some() {
-                // With addresses of their own, hosts name those that are there already, as the guide asks of such hosts: a lane
-                // that was made by hearsay is not tried again where it alone breaks.
-                host.wait_ready()?;
-            }
+            let host = cell.spawn_controller(&controller_name(n))?;
             cell.controllers.push(host);
         }
         for host in &mut cell.controllers {
