@@ -270,7 +270,7 @@ fn every_kind_of_change_leaves_its_entry() {
         assert_eq!(text(&entry["reason"]).is_empty(), done, "{entry}");
     }
     for (what, field, before, after) in [
-        ("loop.setpoint", "setpoint", json!(50.0), json!(42.0)),
+        ("loop.setpoint", "setpoint", json!(40.0), json!(42.0)),
         ("loop.set", "parameters.ti", Value::Null, json!(9.5)),
         ("loop.mode", "mode", json!("manual"), json!("automatic")),
         ("loop.swap", "component", json!("pid@"), json!("pidplus@")),
