@@ -565,15 +565,3 @@ async fn the_server_serves_and_stops() {
     feed.read_to_end(&mut Vec::new()).await.unwrap();
     serving.await.unwrap().expect("a stop is no failure");
 }
-
-/// For a look by hand with other people's tools: serves the cell in memory at `BUMPLESS_API_LISTEN` until the time is over.
-#[tokio::test]
-#[ignore = "serves for a minute; run it by name while a tool asks"]
-async fn serves_the_cell_in_memory_for_a_minute() {
-    let address = std::env::var("BUMPLESS_API_LISTEN").unwrap_or_else(|_| "127.0.0.1:18499".to_owned());
-    let listener = tokio::net::TcpListener::bind(address).await.unwrap();
-    let minute = tokio::time::sleep(std::time::Duration::from_secs(60));
-    crate::server::serve_cell(listener, Arc::new(Fake::new()), &Options::default(), minute)
-        .await
-        .expect("a stop is no failure");
-}

@@ -96,23 +96,7 @@ impl Store {
     /// # Errors
     /// [`Error::Io`], [`Error::Database`].
     pub fn alarm_changes_after<C: DeserializeOwned>(&self, number: u64, max: usize) -> Result<Vec<C>, Error> {
-        let rows = self.inner.base.read("read the alarms' changes from", |txn| {
-            let table = match txn.open_table(CHANGES) {
-                Ok(table) => table,
-                Err(TableError::TableDoesNotExist(_)) => return Ok(Vec::new()),
-                Err(error) => return Err(error.into()),
-            };
-            let mut rows = Vec::new();
-            for row in table.range(number.saturating_add(1)..)?.take(max) {
-                let (number, value) = row?;
-                rows.push((number.value(), format::decode(value.value())));
-            }
-            Ok(rows)
-        })?;
-        Ok(rows
-            .into_iter()
-            .filter_map(|(number, row)| self.row("alarm changes", &number.to_string(), row))
-            .collect())
+        self.changes(number.saturating_add(1), false, max)
     }
 
     /// What happened, newest first, at most `max`. Rows that cannot be read are skipped.
@@ -120,14 +104,20 @@ impl Store {
     /// # Errors
     /// [`Error::Io`], [`Error::Database`].
     pub fn alarm_changes<C: DeserializeOwned>(&self, max: usize) -> Result<Vec<C>, Error> {
+        self.changes(0, true, max)
+    }
+
+    fn changes<C: DeserializeOwned>(&self, first: u64, newest_first: bool, max: usize) -> Result<Vec<C>, Error> {
         let rows = self.inner.base.read("read the alarms' changes from", |txn| {
             let table = match txn.open_table(CHANGES) {
                 Ok(table) => table,
                 Err(TableError::TableDoesNotExist(_)) => return Ok(Vec::new()),
                 Err(error) => return Err(error.into()),
             };
+            let mut range = table.range(first..)?;
+            let next = || if newest_first { range.next_back() } else { range.next() };
             let mut rows = Vec::new();
-            for row in table.iter()?.rev().take(max) {
+            for row in std::iter::from_fn(next).take(max) {
                 let (number, value) = row?;
                 rows.push((number.value(), format::decode(value.value())));
             }

@@ -6,7 +6,6 @@
 use std::{
     io::{BufRead as _, BufReader, Write as _},
     path::Path,
-    process::{Command, Stdio},
     sync::Arc,
 };
 
@@ -18,7 +17,10 @@ use proptest::prelude::*;
 use tempfile::tempdir;
 
 use super::{Archive, Bounds, Disk, Lens, ROWS_MAX, block::tests::series};
-use crate::{Error, Store, tests::samples::record};
+use crate::{
+    Error, Store,
+    tests::{mortal, samples::record},
+};
 
 const S: u64 = STEPS_NS[0];
 const MIB: u64 = 1024 * 1024;
@@ -338,20 +340,13 @@ fn a_full_disk_costs_nothing_that_memory_holds() {
     holds(&open(dir.path()), "level-1", 6_000);
 }
 
-/// Tells the child where to write.
-const DIRECTORY: &str = "BUMPLESS_TEST_KILLED_HISTORY";
-
-/// The child: offers cycles in step with real time, 2,000 a second with the times of ten a second, and says what it offered.
-#[test]
-#[ignore = "the writer that the test beside it starts and kills"]
-fn child() {
-    let Ok(dir) = std::env::var(DIRECTORY) else { return };
-    let archive = open(Path::new(&dir));
+/// The writer: offers cycles in step with real time, 2,000 a second with the times of ten a second, and says what it offered.
+pub(crate) fn write(dir: &Path) {
+    let archive = open(dir);
     let mut n = read(&archive, "level-1", 0)
         .iter()
         .map(|row| row.bucket.cycles)
         .sum::<u64>();
-    let mut out = std::io::stdout();
     loop {
         archive.offer(cycle("level-1", n));
         n += 1;
@@ -360,8 +355,7 @@ fn child() {
             if n.is_multiple_of(700) {
                 archive.pack().unwrap();
             }
-            out.write_all(format!("\nkept {n}\n").as_bytes()).unwrap();
-            out.flush().unwrap();
+            mortal::say(&format!("kept {n}"));
         }
     }
 }
@@ -370,19 +364,7 @@ fn child() {
 fn a_killed_process_keeps_everything_that_was_written_and_nothing_half() {
     let dir = tempdir().unwrap();
     for round in 0..14_u64 {
-        let mut child = Command::new(std::env::current_exe().unwrap())
-            .args([
-                "archive::tests::child",
-                "--exact",
-                "--ignored",
-                "--nocapture",
-                "--test-threads=1",
-            ])
-            .env(DIRECTORY, dir.path())
-            .stdout(Stdio::piped())
-            .stderr(Stdio::null())
-            .spawn()
-            .unwrap();
+        let mut child = mortal::start("history", dir.path());
         let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
         let mut kept = 0;
         for _ in 0..(1 + round * 5 % 23) {

@@ -4,7 +4,6 @@ use std::{
     fs,
     io::{BufRead as _, BufReader, Write as _},
     path::Path,
-    process::{Child, Command, Stdio},
 };
 
 use bumpless_core::{
@@ -13,7 +12,7 @@ use bumpless_core::{
 };
 use tempfile::tempdir;
 
-use super::samples::host;
+use super::{mortal, samples::host};
 use crate::{AUDIT_BYTES_MAX, AuditFound, AuditLog, Error, Store};
 
 const BYTES_MAX: u64 = *AUDIT_BYTES_MAX.start();
@@ -219,39 +218,13 @@ fn what_was_begun_and_never_ended_is_told_once() {
     assert_eq!(open(dir.path()).1.begun, Vec::<String>::new());
 }
 
-/// Tells the child where to write.
-const DIRECTORY: &str = "BUMPLESS_TEST_KILLED_AUDIT";
-
-#[test]
-#[ignore = "the writer that the test beside it starts and kills"]
-fn child() {
-    let Ok(dir) = std::env::var(DIRECTORY) else { return };
-    let (log, _) = open(Path::new(&dir));
-    let mut out = std::io::stdout();
+pub(crate) fn write(dir: &Path) {
+    let (log, _) = open(dir);
     loop {
         let _begun = log.begin("{\"what\":\"x\"}");
         let link = log.append(&[said(7)]).unwrap().remove(0);
-        // One write, so the parent never reads half a line.
-        out.write_all(format!("\npromised {} {}\n", link.number, link.hash).as_bytes())
-            .unwrap();
-        out.flush().unwrap();
+        mortal::say(&format!("promised {} {}", link.number, link.hash));
     }
-}
-
-fn start(dir: &Path) -> Child {
-    Command::new(std::env::current_exe().unwrap())
-        .args([
-            "tests::audit::child",
-            "--exact",
-            "--ignored",
-            "--nocapture",
-            "--test-threads=1",
-        ])
-        .env(DIRECTORY, dir)
-        .stdout(Stdio::piped())
-        .stderr(Stdio::null())
-        .spawn()
-        .unwrap()
 }
 
 #[test]
@@ -259,7 +232,7 @@ fn a_killed_writer_loses_no_entry_that_it_promised() {
     let dir = tempdir().unwrap();
     let mut promised: Option<(u64, Digest)> = None;
     for round in 0..12_u64 {
-        let mut child = start(dir.path());
+        let mut child = mortal::start("audit", dir.path());
         let mut seen = 0;
         let mut heard = |line: &str| {
             let mut words = line.strip_prefix("promised ")?.split(' ');

@@ -1,9 +1,8 @@
 //! The log of cycles: order, windows, the bound, restarts, damage, a queue that is full.
 
 use std::{
-    io::{BufRead, BufReader, Write as _},
+    io::{BufRead, BufReader},
     path::Path,
-    process::{Command, Stdio},
     sync::Arc,
 };
 
@@ -11,7 +10,10 @@ use bumpless_core::{LoopId, Record};
 use proptest::prelude::*;
 use tempfile::tempdir;
 
-use super::samples::{loop_id, record};
+use super::{
+    mortal,
+    samples::{loop_id, record},
+};
 use crate::{CycleLog, Error, Store, Window};
 
 const MIB: u64 = 1024 * 1024;
@@ -251,27 +253,19 @@ fn a_bound_out_of_range_is_refused_in_words() {
     }
 }
 
-/// Tells the child where to write.
-const DIRECTORY: &str = "BUMPLESS_TEST_KILLED_LOG";
-
-/// The child: writes until it is killed, and says which record was brought to the disk.
-#[test]
-#[ignore = "the writer that the test beside it starts and kills"]
-fn child() {
-    let Ok(dir) = std::env::var(DIRECTORY) else { return };
-    let log = open(Path::new(&dir));
+/// The writer: writes until it is killed, and says which record was brought to the disk.
+pub(crate) fn write(dir: &Path) {
+    let log = open(dir);
     let id = loop_id("level-1");
     let last = all(&log, &id, Window::Last(1), false);
     let mut seq = last.last().map_or(0, |r| r.seq);
-    let mut out = std::io::stdout();
     loop {
         for _ in 0..20 {
             seq += 1;
             log.offer(record("level-1", 1, seq));
         }
         log.flush().unwrap();
-        out.write_all(format!("\nwritten {seq}\n").as_bytes()).unwrap();
-        out.flush().unwrap();
+        mortal::say(&format!("written {seq}"));
     }
 }
 
@@ -281,19 +275,7 @@ fn a_killed_writer_leaves_a_log_that_opens_and_has_what_was_written() {
     let id = loop_id("level-1");
     let mut written = 0_u64;
     for round in 0..12_u64 {
-        let mut child = Command::new(std::env::current_exe().unwrap())
-            .args([
-                "tests::cycles::child",
-                "--exact",
-                "--ignored",
-                "--nocapture",
-                "--test-threads=1",
-            ])
-            .env(DIRECTORY, dir.path())
-            .stdout(Stdio::piped())
-            .stderr(Stdio::null())
-            .spawn()
-            .unwrap();
+        let mut child = mortal::start("cycles", dir.path());
         let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
         let mut said = |line: String| {
             if let Some(seq) = line.strip_prefix("written ") {

@@ -1,18 +1,17 @@
 //! A writer that is killed at any moment leaves a store that opens and holds everything it promised.
 
 use std::{
-    io::{BufRead, BufReader, Write as _},
+    io::{BufRead, BufReader},
     path::Path,
-    process::{Child, Command, Stdio},
 };
 
 use tempfile::tempdir;
 
-use super::samples::{intent, loop_id, record, spec};
+use super::{
+    mortal,
+    samples::{intent, loop_id, record, spec},
+};
 use crate::Store;
-
-/// Tells the child where to write.
-const DIRECTORY: &str = "BUMPLESS_TEST_KILLED_WRITER";
 
 const ROUNDS: u64 = 36;
 
@@ -21,15 +20,11 @@ fn component(n: u64) -> Vec<u8> {
     vec![(n % 251) as u8; 1 + usize::try_from(n).unwrap() % 70_000]
 }
 
-/// The child: writes until it is killed, and says on its output what it was promised.
-#[test]
-#[ignore = "the writer that the test beside it starts and kills"]
-fn child() {
-    let Ok(dir) = std::env::var(DIRECTORY) else { return };
-    let store = Store::open(Path::new(&dir)).unwrap();
+/// The writer: writes until it is killed, and says on its output what it was promised.
+pub(crate) fn write(dir: &Path) {
+    let store = Store::open(dir).unwrap();
     let id = loop_id("level-1");
     let mut held = store.intent(&id).unwrap().unwrap_or_else(|| intent("level-1"));
-    let mut out = std::io::stdout();
     loop {
         let n = held.last_revision + 1;
         let digest = store.put_component(&component(n)).unwrap();
@@ -42,26 +37,8 @@ fn child() {
         if n.is_multiple_of(4) {
             store.sync().unwrap();
         }
-        // One write, so the parent never reads half a line.
-        out.write_all(format!("\npromised {n}\n").as_bytes()).unwrap();
-        out.flush().unwrap();
+        mortal::say(&format!("promised {n}"));
     }
-}
-
-fn start(dir: &Path) -> Child {
-    Command::new(std::env::current_exe().unwrap())
-        .args([
-            "tests::killed::child",
-            "--exact",
-            "--ignored",
-            "--nocapture",
-            "--test-threads=1",
-        ])
-        .env(DIRECTORY, dir)
-        .stdout(Stdio::piped())
-        .stderr(Stdio::null())
-        .spawn()
-        .unwrap()
 }
 
 #[test]
@@ -71,7 +48,7 @@ fn a_killed_writer_loses_nothing_that_it_promised() {
     let mut promised = 0;
     let mut lines_seen = 0;
     for round in 0..ROUNDS {
-        let mut child = start(dir.path());
+        let mut child = mortal::start("store", dir.path());
         let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
         // Some rounds die while the store is being made or opened, the others after some writes. The spin spreads the kill
         // over the next write; it is not there to wait for anything.

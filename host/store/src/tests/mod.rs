@@ -7,6 +7,7 @@ mod cycles;
 mod failing_disk;
 mod files;
 mod killed;
+pub(crate) mod mortal;
 mod rows;
 pub(crate) mod samples;
 mod writer;
