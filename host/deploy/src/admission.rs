@@ -38,33 +38,28 @@ impl Room {
         imports: &[String],
         compile_time: Option<Duration>,
     ) -> Result<Admission, Error> {
-        let crowded = |_| {
-            Error::busy(
-                format!("other components are being tried at host {}", self.here),
-                "try again",
-            )
-        };
-        let _turn = timeout(TRIAL_WAIT, self.trials.acquire())
+        let imports = imports.to_vec();
+        self.reported(imports, compile_time, move || trial::run(&prepared))
             .await
-            .map_err(crowded)?
-            .map_err(|_| stopping())?;
-        let trial = on_own_thread(move || trial::run(&prepared)).await?;
-        Ok(report(
-            &trial,
-            self.here.clone(),
-            imports,
-            compile_time,
-            self.clock.unix_ms(),
-        ))
     }
-}
 
-impl Room {
-    /// As [`Room::tried`], for a plant.
+    /// The same for a plant.
     pub(crate) async fn tried_plant(
         &self,
         prepared: Arc<PreparedPlant>,
         compile_time: Option<Duration>,
+    ) -> Result<Admission, Error> {
+        let imports = prepared.imports().to_vec();
+        self.reported(imports, compile_time, move || plant::run(&prepared))
+            .await
+    }
+
+    /// A trial in its turn, on a thread of its own, and its report.
+    async fn reported(
+        &self,
+        imports: Vec<String>,
+        compile_time: Option<Duration>,
+        run: impl FnOnce() -> trial::Trial + Send + 'static,
     ) -> Result<Admission, Error> {
         let crowded = |_| {
             Error::busy(
@@ -76,8 +71,7 @@ impl Room {
             .await
             .map_err(crowded)?
             .map_err(|_| stopping())?;
-        let imports = prepared.imports().to_vec();
-        let trial = on_own_thread(move || plant::run(&prepared)).await?;
+        let trial = on_own_thread(run).await?;
         Ok(report(
             &trial,
             self.here.clone(),

@@ -137,12 +137,20 @@ impl Audit {
         let written = on_disk(move || -> Result<(), Error> {
             let _turn = writing.lock();
             loop {
-                let next: Vec<String> = waiting.lock().iter().take(AT_ONCE).cloned().collect();
+                // Taken out while they are written: what is dropped meanwhile for want of room is none of these.
+                let next: Vec<String> = {
+                    let mut waiting = waiting.lock();
+                    let count = waiting.len().min(AT_ONCE);
+                    waiting.drain(..count).collect()
+                };
                 if next.is_empty() {
                     break;
                 }
-                log.append(&next)?;
-                waiting.lock().drain(..next.len());
+                if let Err(error) = log.append(&next) {
+                    let mut waiting = waiting.lock();
+                    next.into_iter().rev().for_each(|text| waiting.push_front(text));
+                    return Err(error.into());
+                }
             }
             let lost = unsaid.load(Ordering::Relaxed);
             if lost > 0 {
