@@ -46,34 +46,39 @@ const EMPTY: u64 = 0;
 static TAKEN: AtomicU64 = AtomicU64::new(0);
 
 /// A thread's seat, the same in every engine; given back when the thread ends.
-struct Seat(Option<usize>);
+struct Seat {
+    number: Option<usize>,
+    taken: &'static AtomicU64,
+}
 
 impl Seat {
-    fn take() -> Self {
-        let mut taken = TAKEN.load(Ordering::Relaxed);
-        loop {
+    /// The first free one of those that `seats` has a bit each for, or none.
+    fn take(seats: &'static AtomicU64) -> Self {
+        let mut taken = seats.load(Ordering::Relaxed);
+        let number = loop {
             let free = taken.trailing_ones();
             if free as usize >= SEATS {
-                return Self(None);
+                break None;
             }
-            match TAKEN.compare_exchange_weak(taken, taken | 1 << free, Ordering::Relaxed, Ordering::Relaxed) {
-                Ok(_) => return Self(Some(free as usize)),
+            match seats.compare_exchange_weak(taken, taken | 1 << free, Ordering::Relaxed, Ordering::Relaxed) {
+                Ok(_) => break Some(free as usize),
                 Err(now) => taken = now,
             }
-        }
+        };
+        Self { number, taken: seats }
     }
 }
 
 impl Drop for Seat {
     fn drop(&mut self) {
-        if let Some(seat) = self.0 {
-            TAKEN.fetch_and(!(1 << seat), Ordering::Relaxed);
+        if let Some(number) = self.number {
+            self.taken.fetch_and(!(1 << number), Ordering::Relaxed);
         }
     }
 }
 
 thread_local! {
-    static SEAT: Seat = Seat::take();
+    static SEAT: Seat = Seat::take(&TAKEN);
 }
 
 /// A seat's deadline on a line of its own, so that threads do not fight for it.
@@ -131,6 +136,12 @@ impl Drop for Watched<'_> {
 impl Calls {
     /// A call begins now that must be over after `limit_ns`. Nearly always a handful of loads and stores.
     pub(crate) fn begin(&self, now_ns: u64, limit_ns: u64) -> Watched<'_> {
+        // A thread that ends has no seat any more.
+        let seat = SEAT.try_with(|seat| seat.number).ok().flatten();
+        self.begin_in(seat, now_ns, limit_ns)
+    }
+
+    fn begin_in(&self, seat: Option<usize>, now_ns: u64, limit_ns: u64) -> Watched<'_> {
         let seen = &*self.0;
         let wish_ns = limit_ns.clamp(LOOK_MIN_NS, LOOK_MAX_NS);
         let look_ns = seen.look_ns.load(Ordering::Relaxed);
@@ -141,8 +152,6 @@ impl Calls {
         if wish_ns <= look_ns && seen.look_until_ns.load(Ordering::Relaxed) < now_ns + SHORT_FOR_NS / 2 {
             seen.look_until_ns.store(now_ns + SHORT_FOR_NS, Ordering::Relaxed);
         }
-        // A thread that ends has no seat any more.
-        let seat = SEAT.try_with(|seat| seat.0).ok().flatten();
         let mut outer_ns = EMPTY;
         match seat.and_then(|seat| seen.seats.get(seat)) {
             Some(deadline) => {
@@ -259,14 +268,14 @@ mod tests {
     fn the_next_look_is_at_the_first_deadline_or_after_the_shortest_limit() {
         let calls = Calls::default();
         assert_eq!(calls.look(T), (false, T + LOOK_MAX_NS));
-        let slow = calls.begin(T, 50_000_000);
+        let slow = calls.begin_in(Some(3), T, 50_000_000);
         assert_eq!(calls.look(T), (false, T + LOOK_MAX_NS));
         assert_eq!(calls.look(T + 49_000_000), (false, T + 50_000_000));
         assert_eq!(calls.look(T + 50_000_000), (true, T + 50_000_000 + LOOK_MIN_NS));
         drop(slow);
         assert!(!calls.look(T + 50_000_000).0);
 
-        let fast = calls.begin(T, 500_000);
+        let fast = calls.begin_in(Some(3), T, 500_000);
         drop(fast);
         assert_eq!(calls.look(T), (false, T + 500_000));
         // The short limit is forgotten once nobody had it for a second.
@@ -277,8 +286,8 @@ mod tests {
     #[test]
     fn a_call_within_a_call_leaves_the_outer_one_watched() {
         let calls = Calls::default();
-        let outer = calls.begin(T, 1_000_000);
-        let inner = calls.begin(T, 5_000_000);
+        let outer = calls.begin_in(Some(3), T, 1_000_000);
+        let inner = calls.begin_in(Some(3), T, 5_000_000);
         drop(inner);
         assert!(calls.look(T + 1_000_000).0);
         drop(outer);
@@ -286,20 +295,21 @@ mod tests {
     }
 
     #[test]
-    fn calls_beyond_the_seats_make_every_look_a_tick() {
+    fn calls_without_a_seat_make_every_look_a_tick() {
         let calls = Calls::default();
-        let seats: Vec<Seat> = std::iter::repeat_with(Seat::take)
-            .take_while(|seat| seat.0.is_some())
-            .collect();
-        std::thread::scope(|scope| {
-            scope.spawn(|| {
-                let call = calls.begin(T, 50_000_000);
-                assert!(call.seat.is_none() && calls.look(T).0);
-                drop(call);
-                assert!(!calls.look(T).0);
-            });
-        });
-        drop(seats);
-        assert!(Seat::take().0.is_some());
+        let call = calls.begin_in(None, T, 50_000_000);
+        assert!(calls.look(T).0);
+        drop(call);
+        assert!(!calls.look(T).0);
+    }
+
+    #[test]
+    fn seats_end_and_come_back() {
+        static TAKEN: AtomicU64 = AtomicU64::new(0);
+        let mut seats: Vec<Seat> = (0..SEATS).map(|_| Seat::take(&TAKEN)).collect();
+        assert!(seats.iter().map(|seat| seat.number).eq((0..SEATS).map(Some)));
+        assert_eq!(Seat::take(&TAKEN).number, None);
+        drop(seats.remove(7));
+        assert_eq!(Seat::take(&TAKEN).number, Some(7));
     }
 }
