@@ -28,9 +28,8 @@ pub struct Config {
     pub listen: Vec<String>,
     /// Hosts that this one connects to, in the form of `listen`. At most 64; hosts may name each other.
     ///
-    /// One that is up is enough to join: it names the others, and they connect among themselves. But a lost link is only
-    /// tried again, for ever, to a host that is named here; one that was made by hearsay waits until the two hear of each
-    /// other again. So name the I/O hosts, and every other host that has a fixed address.
+    /// One that is up is enough to join: it names the others, and they connect among themselves, again after every cut. A
+    /// host that is named here is tried for ever even where nobody else has met it: so name the I/O hosts.
     #[serde(default)]
     pub connect: Vec<String>,
     /// Also look for hosts by multicast (224.0.0.224, UDP port 7446). Off unless wanted: a plant network is not ours to

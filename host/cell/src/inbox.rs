@@ -1,7 +1,7 @@
 //! Everything that comes in: messages, tokens and requests become arrivals, or are counted as malformed.
 //!
-//! Owns: the reading of what others sent, membership, claims to the name, the limit on reports. Never: panics on what others sent; keeps the
-//! session alive (it holds it weakly).
+//! Owns: the reading of what others sent, membership, claims to the name, the roll, the limit on reports. Never: panics on what
+//! others sent; keeps the session alive (it holds it weakly).
 
 use std::{
     sync::{Arc, OnceLock, Weak, atomic::AtomicUsize},
@@ -25,6 +25,7 @@ use crate::{
     limits::{MALFORMED_REPORTS_PER_S, NOTICE_BYTES_MAX, REPORTED_KEY_CHARS_MAX, REQUESTS_IN_FLIGHT_MAX},
     members::{Change, Members},
     request::{self, Place, Responder},
+    roll::{Entry, Roll, RollCall},
     session::Shared,
     wire,
 };
@@ -41,6 +42,7 @@ pub(crate) struct Inbox {
     /// Since when this host's own token is out: from then on a namesake is a conflict.
     joined_at: OnceLock<Instant>,
     claims: Mutex<Claims>,
+    roll: Mutex<Roll>,
     sink: Sink,
     pub(crate) runtime: Handle,
     in_flight: Arc<AtomicUsize>,
@@ -56,6 +58,7 @@ impl Inbox {
         Self {
             keys,
             host,
+            roll: Mutex::new(Roll::new(instance.clone())),
             instance,
             tally: Tally::default(),
             shared: OnceLock::new(),
@@ -187,6 +190,36 @@ impl Inbox {
                 instance: claim.instance.as_str().to_owned(),
             });
         }
+    }
+
+    /// A host called the roll.
+    pub(crate) fn on_roll_call(&self, put: &Put) {
+        let (key, payload) = (put.key_expr().as_str(), put.payload());
+        let call = wire::fits::<RollCall>(payload.len()).and_then(|()| wire::decode::<RollCall>(&payload.to_bytes()));
+        let sender = self.keys.parse(key);
+        match (call, sender) {
+            (Ok(call), Ok(Key::Roll(host))) if call.own.host == host => self.roll.lock().hear(call, Instant::now()),
+            (Ok(_), Ok(_)) => {
+                let reason = "it names another sender than its key".to_owned();
+                let (what, bytes) = ("roll call", payload.len());
+                self.malformed(key, &Error::Undecodable { what, bytes, reason });
+            }
+            (Err(error), _) | (_, Err(error)) => self.malformed(key, &error),
+        }
+    }
+
+    /// Who is named in this host's next call.
+    pub(crate) fn named(&self) -> Vec<Entry> {
+        let members = self.members.read();
+        self.roll.lock().name(|e| members.has(&e.host, &e.instance))
+    }
+
+    /// Whom this host calls now.
+    pub(crate) fn due(&self) -> Vec<Entry> {
+        let members = self.members.read();
+        self.roll
+            .lock()
+            .due(Instant::now(), |e| members.has(&e.host, &e.instance))
     }
 
     /// A query for this host.
@@ -379,7 +412,7 @@ fn read<'a>(
             bytes: len,
             limit: NOTICE_BYTES_MAX,
         }),
-        Key::Request { .. } | Key::Alive(..) | Key::Claim(_) => Err(Error::Key {
+        Key::Request { .. } | Key::Alive(..) | Key::Claim(_) | Key::Roll(_) => Err(Error::Key {
             key: cut(key, REPORTED_KEY_CHARS_MAX),
             reason: "it carries no messages",
         }),

@@ -9,6 +9,7 @@
 //! bumpless/<cell>/vitals/<host>               how a host is
 //! bumpless/<cell>/notice/<host>               something changed at a host
 //! bumpless/<cell>/claim/<host>                what hosts of one name say to each other
+//! bumpless/<cell>/roll/<host>                 who is in the cell and where each listens, as a host knows it
 //! bumpless/<cell>/alive/<host>/<instance>     liveliness token of one life of a host
 //! bumpless/<cell>/open/<door>/<host>          what programs that are no hosts may ask (see `door`)
 //! ```
@@ -127,6 +128,8 @@ pub enum Key {
     Notice(HostId),
     /// What hosts of this name say to each other.
     Claim(HostId),
+    /// Who a host has met, and where each listens.
+    Roll(HostId),
     /// The token of one life of a host.
     Alive(HostId, Instance),
 }
@@ -155,6 +158,7 @@ impl Keys {
             Key::Vitals(host) => format!("{PREFIX}/{cell}/vitals/{host}"),
             Key::Notice(host) => format!("{PREFIX}/{cell}/notice/{host}"),
             Key::Claim(host) => format!("{PREFIX}/{cell}/claim/{host}"),
+            Key::Roll(host) => format!("{PREFIX}/{cell}/roll/{host}"),
             Key::Alive(host, instance) => format!("{PREFIX}/{cell}/alive/{host}/{}", instance.0),
         }
     }
@@ -206,6 +210,7 @@ impl Keys {
             "vitals" => Key::Vitals(host(next()?)?),
             "notice" => Key::Notice(host(next()?)?),
             "claim" => Key::Claim(host(next()?)?),
+            "roll" => Key::Roll(host(next()?)?),
             "alive" => {
                 let id = host(next()?)?;
                 Key::Alive(
@@ -251,6 +256,12 @@ impl Keys {
         format!("{PREFIX}/{}/notice/*", self.cell)
     }
 
+    /// Every host's roll calls.
+    #[must_use]
+    pub fn all_rolls(&self) -> String {
+        format!("{PREFIX}/{}/roll/*", self.cell)
+    }
+
     /// Every token.
     #[must_use]
     pub fn all_alive(&self) -> String {
@@ -291,6 +302,7 @@ mod tests {
             host().prop_map(Key::Vitals),
             host().prop_map(Key::Notice),
             host().prop_map(Key::Claim),
+            host().prop_map(Key::Roll),
             (host(), any::<u64>(), any::<u64>()).prop_map(|(id, at, r)| Key::Alive(id, Instance::new(at, r))),
         ]
     }

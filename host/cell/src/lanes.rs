@@ -6,7 +6,7 @@
 //! lane                              priority     when the link is full
 //! sample answer step … ping pong    real time    drop: the cycle's deadline copes
 //! record                            real time    drop: in one queue with the samples, so that a record is not overtaken
-//! vitals notice claim               data high    drop: the next one says more
+//! vitals notice claim roll               data high    drop: the next one says more
 //! request and reply                 data low     block, on a thread that may wait
 //! ```
 //!
@@ -66,6 +66,7 @@ pub(crate) struct Lanes {
     vitals: Publisher<'static>,
     notice: Publisher<'static>,
     claim: Publisher<'static>,
+    roll: Publisher<'static>,
 }
 
 impl Lanes {
@@ -75,6 +76,7 @@ impl Lanes {
             vitals: news(Key::Vitals(host.clone()))?,
             notice: news(Key::Notice(host.clone()))?,
             claim: news(Key::Claim(host.clone()))?,
+            roll: news(Key::Roll(host.clone()))?,
             keys,
             host,
             hosts: RwLock::default(),
@@ -104,6 +106,10 @@ impl Lanes {
 
     pub(crate) fn claim(&self, bytes: Vec<u8>) -> Result<(), Error> {
         put(&self.claim, "claim to a name", bytes)
+    }
+
+    pub(crate) fn roll(&self, bytes: Vec<u8>) -> Result<(), Error> {
+        put(&self.roll, "roll call", bytes)
     }
 
     /// Declares the lanes to a host, so that no cycle has to.

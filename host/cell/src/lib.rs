@@ -10,7 +10,7 @@
 //! any task ────── request().await ─────► query ═════════════════════════► inbox ──► sink(Request) ── Responder::reply
 //! ```
 //!
-//! Reading order: `config`, `keys`, `wire`, `arrival`, then `session` with `lanes`, `inbox`, `members`, `claims` and `request`;
+//! Reading order: `config`, `keys`, `wire`, `arrival`, then `session` with `lanes`, `inbox`, `members`, `claims`, `roll` and `request`;
 //! `vitals` and `probe` stand alone.
 
 pub mod limits;
@@ -27,6 +27,7 @@ mod lanes;
 mod members;
 mod probe;
 mod request;
+mod roll;
 mod session;
 mod vitals;
 pub mod wire;

@@ -53,6 +53,11 @@ impl Members {
         })
     }
 
+    /// Is this life's token there?
+    pub(crate) fn has(&self, host: &HostId, instance: &Instance) -> bool {
+        self.lives.get(host).is_some_and(|lives| lives.contains(instance))
+    }
+
     /// Everyone, in the order of names.
     pub(crate) fn hosts(&self) -> Vec<HostId> {
         self.lives.keys().cloned().collect()

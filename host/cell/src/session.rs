@@ -1,6 +1,7 @@
 //! A host's place on the bus: opened once, shared by all, closed at the end.
 //!
-//! Owns: the Zenoh session and everything declared on it. Never: blocks in a `send_*` or `publish_*`.
+//! Owns: the Zenoh session and everything declared on it, and the calls to hosts that are not met. Never: blocks in a `send_*` or
+//! `publish_*`.
 //!
 //! ```text
 //! open ─► connected ─► name free? ──no, after lease + 500 ms──► Err(NameTaken)
@@ -21,11 +22,19 @@ use std::{
 
 use bumpless_core::{
     HostId, LoopId, Record,
+    chatter::{ROLL_NS_MIN, pause_ns},
     protocol::{Answer, Sample, StepAnswer, StepRequest},
 };
 use parking_lot::Mutex;
 use tokio::{runtime::Handle, sync::oneshot};
-use zenoh::{Wait, liveliness::LivelinessToken, sample::Sample as Put};
+use zenoh::{
+    Wait,
+    config::Locator,
+    internal::runtime::{Runtime, RuntimeBuilder, ZRuntime},
+    liveliness::LivelinessToken,
+    sample::Sample as Put,
+    session::ZenohId,
+};
 
 use crate::{
     arrival::Sink,
@@ -37,6 +46,7 @@ use crate::{
     lanes::Lanes,
     limits::{NAME_WAIT_MARGIN_MS, NOTICE_BYTES_MAX},
     request,
+    roll::{Entry, RollCall},
     vitals::Vitals,
     wire::{self, Letter, Token},
 };
@@ -45,6 +55,8 @@ use crate::{
 const NAME_LOOK_PERIOD: Duration = Duration::from_millis(50);
 /// Longest wait for one look.
 const NAME_LOOK_TIMEOUT: Duration = Duration::from_secs(1);
+/// How often a host looks whom it should have met and has not.
+const ROLL_LOOK_PERIOD: Duration = Duration::from_secs(1);
 
 /// What the clones of a session share.
 pub(crate) struct Shared {
@@ -54,6 +66,8 @@ pub(crate) struct Shared {
     locators: Vec<String>,
     /// None only while the last clone is being dropped.
     zenoh: Option<zenoh::Session>,
+    /// What the session runs on. Only this can be asked for a link.
+    runtime: Runtime,
 }
 
 /// A host's place on the bus. Clones are the same place.
@@ -89,13 +103,19 @@ impl Session {
 
     fn join(config: &Config, zenoh_config: zenoh::Config, sink: Sink, runtime: Handle) -> Result<Self, Error> {
         let host = config.host.clone();
-        let zenoh = zenoh::open(zenoh_config).wait().map_err(|source| Error::Open {
+        let (zenoh, zenoh_runtime) = open(zenoh_config).map_err(|source| Error::Open {
             host: host.clone(),
             listen: config.listen.clone(),
             source,
         })?;
         let keys = Keys::new(config.cell.clone());
-        let inbox = Arc::new(Inbox::new(keys.clone(), host.clone(), instance(&zenoh), sink, runtime));
+        let inbox = Arc::new(Inbox::new(
+            keys.clone(),
+            host.clone(),
+            instance_of(zenoh.zid()),
+            sink,
+            runtime,
+        ));
         let lanes = Lanes::new(&zenoh, keys.clone(), host.clone())?;
         let locators = zenoh.info().locators().wait().iter().map(ToString::to_string).collect();
         let shared = Arc::new(Shared {
@@ -104,6 +124,7 @@ impl Session {
             token: Mutex::new(None),
             locators,
             zenoh: Some(zenoh),
+            runtime: zenoh_runtime,
         });
         // Set once, here: the error would be that it was set before.
         let _ = shared.inbox.shared.set(Arc::downgrade(&shared));
@@ -122,6 +143,7 @@ impl Session {
         for other in &others {
             session.shared.inbox.on_namesake(other);
         }
+        session.shared.call_the_roll();
         Ok(session)
     }
 
@@ -129,6 +151,12 @@ impl Session {
     #[must_use]
     pub fn host(&self) -> &HostId {
         &self.shared.inbox.host
+    }
+
+    /// This life of it.
+    #[must_use]
+    pub fn instance(&self) -> &Instance {
+        &self.shared.inbox.instance
     }
 
     /// Where this host really listens, as Zenoh endpoints: with the port that a configured 0 became.
@@ -245,7 +273,8 @@ impl Session {
         let Ok(zenoh) = self.shared.zenoh().cloned() else {
             return;
         };
-        let closed = waiting(self.host(), move || zenoh.close().wait()).await;
+        let runtime = self.shared.runtime.clone();
+        let closed = waiting(self.host(), move || close(&zenoh, &runtime)).await;
         match closed {
             Ok(Ok(())) => {}
             Ok(Err(error)) => tracing::debug!(host = %self.host(), %error, "the bus did not close cleanly"),
@@ -303,6 +332,13 @@ impl Shared {
         zenoh
             .declare_subscriber(key.clone())
             .callback(move |put: Put| inbox.on_claim(&put))
+            .background()
+            .wait()
+            .map_err(|source| Error::Declare { key, source })?;
+        let (key, inbox) = (keys.all_rolls(), Arc::clone(&self.inbox));
+        zenoh
+            .declare_subscriber(key.clone())
+            .callback(move |put: Put| inbox.on_roll_call(&put))
             .background()
             .wait()
             .map_err(|source| Error::Declare { key, source })?;
@@ -403,6 +439,51 @@ impl Shared {
         true
     }
 
+    /// From now on this host says who it has met, and calls those whom it has not, until the session is let go.
+    fn call_the_roll(self: &Arc<Self>) {
+        let weak = Arc::downgrade(self);
+        drop(self.inbox.runtime.spawn(async move {
+            let mut beat = tokio::time::interval(ROLL_LOOK_PERIOD);
+            beat.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+            let mut said_at: Option<Instant> = None;
+            loop {
+                beat.tick().await;
+                let Some(shared) = weak.upgrade() else { return };
+                let pause = Duration::from_nanos(pause_ns(ROLL_NS_MIN, shared.inbox.hosts().len() + 1));
+                if said_at.is_none_or(|said_at| said_at.elapsed() >= pause) {
+                    said_at = Some(Instant::now());
+                    shared.say_whom_it_met();
+                }
+                for entry in shared.inbox.due() {
+                    shared.call(entry);
+                }
+            }
+        }));
+    }
+
+    fn say_whom_it_met(&self) {
+        let inbox = &self.inbox;
+        let call = RollCall {
+            own: Entry::new(inbox.host.clone(), inbox.instance.clone(), &self.locators),
+            met: inbox.named(),
+        };
+        if let Err(error) = wire::encode(&call).and_then(|bytes| self.lanes.roll(bytes)) {
+            tracing::debug!(host = %inbox.host, %error, "a roll call was not sent");
+        }
+    }
+
+    /// Tries a link to a host. The attempt ends by Zenoh's own time-outs and is never dropped half-way: Zenoh would think it still
+    /// ran, and make no further one.
+    fn call(&self, entry: Entry) {
+        let locators: Vec<Locator> = entry.locators.iter().filter_map(|text| text.parse().ok()).collect();
+        let Some(id) = zenoh_id(&entry.instance) else { return };
+        let (runtime, own) = (self.runtime.clone(), self.inbox.host.clone());
+        drop(ZRuntime::Net.spawn(async move {
+            let met = runtime.connect_peer(&id.into(), &locators).await;
+            tracing::debug!(host = %own, called = %entry.host, at = ?entry.locators, met, "a host that was not met was called");
+        }));
+    }
+
     pub(crate) fn warm(&self, host: &HostId) {
         if let Err(error) = self.zenoh().and_then(|zenoh| self.lanes.warm(zenoh, host)) {
             tracing::debug!(%host, %error, "the lanes to a host were not declared ahead");
@@ -418,7 +499,8 @@ impl Drop for Shared {
     fn drop(&mut self) {
         // Zenoh waits while it closes, and panics if it has to do that on a single-threaded runtime.
         if let Some(zenoh) = self.zenoh.take() {
-            let closing = move || drop(zenoh.close().wait());
+            let runtime = self.runtime.clone();
+            let closing = move || drop(close(&zenoh, &runtime));
             drop(
                 std::thread::Builder::new()
                     .name("bumpless-bus".to_owned())
@@ -442,10 +524,32 @@ async fn waiting<T: Send + 'static>(host: &HostId, call: impl FnOnce() -> T + Se
     receiver.await.map_err(|_| Error::Closed { host: host.clone() })
 }
 
+/// A session, and what it runs on: what `zenoh::open` does, in its order. That one keeps the second to itself.
+fn open(config: zenoh::Config) -> Result<(zenoh::Session, Runtime), zenoh::Error> {
+    ZRuntime::Application.block_in_place(async {
+        let mut runtime = RuntimeBuilder::new(config).build().await?;
+        let session = zenoh::session::init(runtime.clone().into()).await?;
+        runtime.start().await?;
+        Ok((session, runtime))
+    })
+}
+
+fn close(session: &zenoh::Session, runtime: &Runtime) -> Result<(), zenoh::Error> {
+    let said = session.close().wait();
+    runtime.close().wait()?;
+    said
+}
+
+/// The identity that an instance is made of; see [`instance_of`].
+fn zenoh_id(instance: &Instance) -> Option<ZenohId> {
+    let half = |digits: std::ops::Range<usize>| u64::from_str_radix(instance.as_str().get(digits)?, 16).ok();
+    let (high, low) = (half(0..16)?, half(16..32)?);
+    ZenohId::try_from([low.to_be_bytes(), high.to_be_bytes()].concat().as_slice()).ok()
+}
+
 /// One life: the random identity that Zenoh drew for the session.
-fn instance(zenoh: &zenoh::Session) -> Instance {
-    let (low, high) = zenoh
-        .zid()
+fn instance_of(id: ZenohId) -> Instance {
+    let (low, high) = id
         .to_le_bytes()
         .into_iter()
         .enumerate()
@@ -457,4 +561,17 @@ fn instance(zenoh: &zenoh::Session) -> Instance {
             }
         });
     Instance::new(high, low)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_instance_leads_back_to_its_identity() {
+        let id = ZenohId::default();
+        let life = instance_of(id);
+        assert_eq!(zenoh_id(&life), Some(id));
+        assert_eq!(zenoh_id(&Instance::new(0, 0)), None);
+    }
 }

@@ -1,9 +1,10 @@
 //! Coming, going, names, other cells, and hosts that learn of each other from a third.
 
-use bumpless_cell::{Arrival, Error};
+use bumpless_cell::{Arrival, Error, wire::VERSION};
 
 use crate::{
     PATIENCE, Peer, config,
+    malformed::stranger,
     nouns::{host, record, step_answers, step_request},
     pair, same,
 };
@@ -174,6 +175,38 @@ async fn hosts_that_know_only_a_third_work_together() {
     c.session.ping(b.name(), 6);
     b.wait_for("a ping", |x| matches!(x, Arrival::Ping { token: 6, .. }).then_some(()))
         .await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
+async fn a_host_calls_one_that_a_third_has_met() {
+    let (mut b, mut c) = (Peer::join("roll", "b", &[]).await, Peer::join("roll", "c", &[]).await);
+    // One that has met C says so to B, and nothing else tells B of C.
+    let third = stranger(&b);
+    let entry = |name: &str, life: &str, locators: Vec<String>| (name.to_owned(), life.to_owned(), locators);
+    let met = vec![entry("c", c.session.instance().as_str(), c.session.locators())];
+    let own = entry("third", &"5".repeat(32), Vec::new());
+    let mut call = vec![VERSION];
+    call.extend(postcard::to_stdvec(&(own, met)).unwrap());
+    third.put("bumpless/roll/roll/third", call).await.unwrap();
+    b.wait_up("c").await;
+    c.wait_up("b").await;
+
+    // A call under another's name, and one that is none, are reported and change nothing.
+    let forged = postcard::to_stdvec(&(entry("b", &"6".repeat(32), Vec::new()), Vec::<()>::new())).unwrap();
+    for (bytes, why) in [
+        ([&[VERSION], forged.as_slice()].concat(), "another sender than its key"),
+        (vec![VERSION, 0xff], "roll call"),
+    ] {
+        third.put("bumpless/roll/roll/third", bytes).await.unwrap();
+        let reason = b
+            .wait_for("a report", |arrival| match arrival {
+                Arrival::Malformed { reason, .. } => Some(reason),
+                _ => None,
+            })
+            .await;
+        assert!(reason.contains(why), "{reason}");
+    }
+    third.close().await.unwrap();
 }
 
 #[tokio::test]

@@ -11,7 +11,7 @@ use crate::{
 
 /// A bare Zenoh session that is linked to the host, and knows that the host listens. Zenoh closes it on a runtime of
 /// several threads only.
-fn stranger(a: &Peer) -> zenoh::Session {
+pub(crate) fn stranger(a: &Peer) -> zenoh::Session {
     let mut config = zenoh::Config::default();
     for (key, value) in [
         ("mode", "\"peer\"".to_owned()),
