@@ -9,7 +9,7 @@
 import { computed, effect, signal } from "@preact/signals";
 import { get_list, send, remove } from "./api";
 import { value } from "./format";
-import { addresses, alarm_news, link, loops, points } from "./live";
+import { alarm_news, link, loops, points } from "./live";
 import type { Alarm, AlarmDefinition, AlarmList, Flood, Priority } from "./types";
 import { by } from "./who";
 
@@ -286,10 +286,10 @@ setInterval(() => {
 }, 1_000);
 
 let looked = 0;
-/** Begins to look; where the host has no alarms nothing is asked. */
+/** Begins to look. */
 export function follow_alarms(): void {
   effect(() => {
-    if (link.value !== "live" || !addresses.value.has("/v1/alarms")) return;
+    if (link.value !== "live") return;
     void load_alarms();
     if (loops.peek().size <= DEFINED_LOOPS_MAX) load_defined().catch(() => undefined);
   });
@@ -303,7 +303,7 @@ export function follow_alarms(): void {
     }
   });
   setInterval(() => {
-    if (document.hidden || link.peek() !== "live" || !addresses.peek().has("/v1/alarms") || performance.now() - looked < LOOK_MS) return;
+    if (document.hidden || link.peek() !== "live" || performance.now() - looked < LOOK_MS) return;
     looked = performance.now();
     void load_alarms();
   }, 500);

@@ -1,9 +1,10 @@
-// The alarms: what stands, what is kept quiet, what happened, and what is defined.
+// The alarms: what stands, what is kept quiet, what happened, what is defined, and how the whole does.
 
 import { signal } from "@preact/signals";
 import { useEffect, useState } from "preact/hooks";
 import { alarms_read, defined, floods, in_order, is_unseen, key_of, KINDS, type Known, load_defined, PRIORITIES, says, scale_of, set_sound, silent_homes, sound, STATE, told } from "./alarms";
 import { acknowledge, AlarmDialog, AlarmForm, Prio, put_back, reset, StateWord, unshelve } from "./alarm_parts";
+import { Load } from "./alarm_load";
 import { get } from "./api";
 import { ago, clock, day, value, when, zone } from "./format";
 import { loops, tick } from "./live";
@@ -16,6 +17,7 @@ const TABS: [string, string][] = [
   ["quiet", "Kept quiet"],
   ["history", "History"],
   ["defined", "Defined"],
+  ["load", "Figures"],
 ];
 /** Rows that a table shows at most; the rest is found by filter. */
 const ROWS_MAX = 400;
@@ -76,6 +78,7 @@ export function Alarms(props: { tab: string }) {
       {tab === "quiet" && <Quiet open={set_open} />}
       {tab === "history" && <Past open={set_open} />}
       {tab === "defined" && <Defined open={set_open} />}
+      {tab === "load" && <Load open={set_open} />}
       {open && <AlarmDialog key={key_of(open)} loop={open.loop} name={open.name} close={() => set_open(null)} />}
     </>
   );

@@ -4,7 +4,7 @@ import { signal } from "@preact/signals";
 import { useState } from "preact/hooks";
 import { send } from "./api";
 import { bytes, clock, day, duration_us, zone } from "./format";
-import { addresses, demo, hosts, loops, notices } from "./live";
+import { demo, hosts, loops, notices } from "./live";
 import { told } from "./alarms";
 import type { Host, Weight } from "./types";
 import { Act, Bar, Danger, None, say } from "./ui";
@@ -120,7 +120,7 @@ function HostCard({ host }: { host: Host }) {
           open its page
         </a>
       )}
-      {host.control && host.alive && addresses.value.has("/v1/hosts/{name}/drain") && <Drain host={host} />}
+      {host.control && host.alive && <Drain host={host} />}
       {demo.value && (
         <div class="row wrap faults" role="group" aria-label={`Faults of ${host.name}`}>
           {host.alive ? (

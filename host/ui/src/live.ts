@@ -36,8 +36,6 @@ export const trouble = signal("");
 /** Records that this page was too slow for, since it was loaded. */
 export const lost_rows = signal(0);
 export const demo = signal(false);
-/** Addresses that this host has: what is not there has no button. */
-export const addresses = signal<Set<string>>(new Set());
 
 /** A loop as the page follows it. */
 export class Followed {
@@ -302,15 +300,13 @@ export function forced_ports(loop: Loop | null): { port: string; point: Point }[
 /** What the feed does not bring by itself. */
 async function load(): Promise<void> {
   try {
-    const [told, is_demo, document] = await Promise.all([
+    const [told, is_demo] = await Promise.all([
       get<{ notices: Notice[] }>("/v1/notices?limit=1000"),
       get<{ demo: boolean }>("/v1/demo"),
-      get<{ paths: Record<string, unknown> }>("/openapi.json"),
     ]);
     batch(() => {
       notices.value = told.notices;
       demo.value = is_demo.demo;
-      addresses.value = new Set(Object.keys(document.paths));
     });
   } catch (error) {
     trouble.value = words(error);

@@ -14,7 +14,7 @@ import { Lab } from "./lab";
 import { NameField } from "./name";
 import { Points } from "./points";
 import { clock, zone } from "./format";
-import { addresses, forced, here, hosts, link, loops, lost_at, notices, start, tick, trouble } from "./live";
+import { forced, here, hosts, link, loops, lost_at, notices, start, tick, trouble } from "./live";
 import { Library, take_into_library } from "./library";
 import { Overview, abnormal } from "./overview";
 import { Rollouts } from "./rollouts";
@@ -47,9 +47,6 @@ const VIEWS: [string, string][] = [
   ["lab", "Lab"],
   ["audit", "Audit"],
 ];
-/** What a host must have so that a view is offered. */
-const NEEDS: Record<string, string> = { alarms: "/v1/alarms", lab: "/v1/lab/reports", audit: "/v1/audit" };
-const offered = (view: string): boolean => !NEEDS[view] || addresses.value.size === 0 || addresses.value.has(NEEDS[view]);
 
 const help = signal(false);
 const naming = signal(false);
@@ -159,7 +156,7 @@ function Frame() {
           Bumpless
         </a>
         <nav aria-label="Places">
-          {VIEWS.filter(([id]) => offered(id)).map(([id, name]) => {
+          {VIEWS.map(([id, name]) => {
             const [count, kind] = marks[id] ?? [0, ""];
             const current = what === id || (id === "" && ["loop", "change", "new"].includes(what));
             return (
@@ -174,7 +171,7 @@ function Frame() {
             );
           })}
         </nav>
-        {offered("alarms") && <Bell />}
+        <Bell />
         <div class="status">
           <span class={`link ${link.value}`}>
             <i />

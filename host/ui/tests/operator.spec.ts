@@ -136,10 +136,18 @@ test("many are acknowledged at once, in their order; a latched one wants a reset
   for (const name of ["low-one", "medium-one", "high-one"]) await undefine("tank-2", name);
 });
 
-test("a flood is said in every view", async ({ page }) => {
+test("a flood is said in every view, and judged by ISA-18.2", async ({ page }) => {
   for (let n = 0; n < 12; n++) await define("tank-3", `flood-${n}`, { kind: "hi", limit: 1, priority: "low" });
   await open(page, "hosts");
   await expect(page.getByRole("alert").filter({ hasText: "Alarm flood." })).toContainText(/1[2-9] alarms in ten minutes|[2-9]\d alarms in ten minutes/);
+  await open(page, "alarms/load");
+  const judged = page.getByRole("region", { name: "Table of figures" }).getByRole("row");
+  await expect(judged.filter({ hasText: "– the most" })).toContainText("exceeded");
+  await expect(judged.filter({ hasText: "more than a day" })).not.toContainText("exceeded");
+  await expect(page.getByRole("img", { name: /Comings in each ten minutes of the last day, at most (1[2-9]|[2-9]\d)/ })).toBeVisible();
+  await figure(page, "alarm-figures");
+  await page.getByRole("region", { name: "Table of frequent alarms" }).getByRole("button", { name: /tank-/ }).first().click();
+  await expect(page.getByRole("dialog")).toBeVisible();
   for (let n = 0; n < 12; n++) await undefine("tank-3", `flood-${n}`);
 });
 
@@ -397,7 +405,7 @@ for (const [name, width, height, scheme] of [
     await page.emulateMedia({ colorScheme: scheme });
     await page.setViewportSize({ width, height });
     const found: string[] = [];
-    for (const place of ["alarms", "alarms/quiet", "alarms/history", "alarms/defined", "points", "points/jobs", "hosts", "lab", "audit", "loop/tank-1"]) {
+    for (const place of ["alarms", "alarms/quiet", "alarms/history", "alarms/defined", "alarms/load", "points", "points/jobs", "hosts", "lab", "audit", "loop/tank-1"]) {
       await open(page, place);
       await expect(page.getByRole("heading", { level: 1 })).toBeVisible();
       await expect(page.locator(".bell.waiting.high")).toBeVisible();
