@@ -54,8 +54,8 @@ const MISDEEDS: [(&str, &[(&str, f64)]); 4] = [
     ("returns-nan", &[]),
     ("jumps", &[("by", 50.0)]),
 ];
-/// How long nothing is changed at first; a quick run takes a fifth of it.
-const UNDISTURBED: Duration = Duration::from_secs(30);
+/// How long nothing is changed at first, in s; a quick run takes a fifth of it.
+const UNDISTURBED_S: u64 = 30;
 /// Longest wait for a swap that a kill hit.
 const SETTLE: Duration = Duration::from_secs(30);
 
@@ -169,7 +169,7 @@ pub(crate) fn run(options: Options, switching: Switching, report: &mut Report) -
 
     report.progress("nothing is changed at first");
     let quiet_from_ns = clock.now_ns();
-    std::thread::sleep(UNDISTURBED / options.count(1, 5));
+    std::thread::sleep(Duration::from_secs(options.count(UNDISTURBED_S, UNDISTURBED_S / 5)));
     let quiet = (quiet_from_ns, clock.now_ns());
 
     let before = Tally::ask(&api, LOOP)?;

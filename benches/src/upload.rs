@@ -260,7 +260,7 @@ fn wait_ready(api: &Api, digest: &str, hosts: usize) -> Result<(), Error> {
     let started = Instant::now();
     loop {
         let shown = api.get(&format!("/v1/components/{digest}"))?;
-        if shown["ready_on"].as_array().is_some_and(|hosts| hosts.len() >= hosts) {
+        if shown["ready_on"].as_array().is_some_and(|ready| ready.len() >= hosts) {
             return Ok(());
         }
         if started.elapsed() > READY_MAX {
