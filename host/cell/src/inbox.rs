@@ -222,6 +222,11 @@ impl Inbox {
             .due(Instant::now(), |e| members.has(&e.host, &e.instance))
     }
 
+    /// One that was called is linked now, or is not: is the link to be closed?
+    pub(crate) fn called(&self, instance: &Instance, is_linked: bool) -> bool {
+        self.roll.lock().called(instance, is_linked, Instant::now())
+    }
+
     /// A query for this host.
     pub(crate) fn on_query(&self, query: Query) {
         count(&self.tally.requests);

@@ -10,12 +10,13 @@
 //! any task ────── request().await ─────► query ═════════════════════════► inbox ──► sink(Request) ── Responder::reply
 //! ```
 //!
-//! Reading order: `config`, `keys`, `wire`, `arrival`, then `session` with `lanes`, `inbox`, `members`, `claims`, `roll` and `request`;
+//! Reading order: `config`, `keys`, `wire`, `arrival`, then `session` with `bus`, `lanes`, `inbox`, `members`, `claims`, `roll` and `request`;
 //! `vitals` and `probe` stand alone.
 
 pub mod limits;
 
 mod arrival;
+mod bus;
 mod claims;
 mod config;
 mod counters;

@@ -1,6 +1,6 @@
 //! Who is in the cell and where each listens, by each one's own word and by that of those who met it. Pure.
 //!
-//! Owns: the table of lives, whom to name to others, and when to call one that is not met. Never: calls anybody; reads a clock;
+//! Owns: the table of lives, whom to name to others, when to call one that is not met, and when to give a link up. Never: calls anybody; reads a clock;
 //! decides how often the roll is called (`core/chatter`).
 //!
 //! ```text
@@ -8,10 +8,13 @@
 //!                              │ ▲                                                    │
 //!                              │ └───────────────── its token is gone ◄───────────────┘
 //!                              ├─ not met for 2 s (7 s at the lesser of the two lives) ─► called, again after 1, 2, 4, 8, 10, 10 … s
+//!                              │      └─ a link is there, for 3 s, and no token ─► the link is closed, and made anew
 //!                              └─ named by nobody for 10 minutes ─► forgotten
 //! ```
 //! Zenoh tries a link for ever only where its far end is in `connect`. Two hosts that know each other through a third get one
 //! attempt when the third tells of them, and none after a cut that outlasts the lease. The roll gives them further ones.
+//! A cut that only one of the two noticed leaves the other with a link that it believes whole: a new one becomes part of it, and what it
+//! declared once it does not declare again. The one that sees a link and no token closes it, for both.
 
 use std::{
     collections::BTreeMap,
@@ -44,6 +47,8 @@ const PATIENCE: Duration = Duration::from_secs(2);
 const PATIENCE_OF_THE_LESSER: Duration = Duration::from_secs(7);
 /// First and longest pause between two calls.
 const PAUSES: (Duration, Duration) = (Duration::from_secs(1), Duration::from_secs(10));
+/// A link over which no token has come for so long is deaf. Tokens come with the first messages of a link.
+const DEAF_AFTER: Duration = Duration::from_secs(3);
 /// A life that nobody has named for so long is over.
 const FORGOTTEN_AFTER: Duration = Duration::from_secs(600);
 
@@ -118,6 +123,8 @@ struct Known {
 struct Missing {
     call_at: Instant,
     pause: Duration,
+    /// Since when a link to it is there all the same.
+    linked_at: Option<Instant>,
 }
 
 /// The lives that this host knows of.
@@ -196,6 +203,7 @@ impl Roll {
                         PATIENCE_OF_THE_LESSER
                     },
                 pause: PAUSES.0,
+                linked_at: None,
             });
             if now >= missing.call_at && !known.entry.locators.is_empty() && due.len() < CALLED_MAX {
                 missing.call_at = now + missing.pause;
@@ -204,6 +212,27 @@ impl Roll {
             }
         }
         due
+    }
+
+    /// One that was called is linked now, or is not. Is the link deaf, and to be closed?
+    pub(crate) fn called(&mut self, instance: &Instance, is_linked: bool, now: Instant) -> bool {
+        let Some(missing) = self.known.get_mut(instance).and_then(|known| known.missing.as_mut()) else {
+            return false;
+        };
+        if !is_linked {
+            missing.linked_at = None;
+            return false;
+        }
+        let linked_at = *missing.linked_at.get_or_insert(now);
+        let is_deaf = now.saturating_duration_since(linked_at) >= DEAF_AFTER;
+        if is_deaf {
+            *missing = Missing {
+                call_at: now + PAUSES.0,
+                pause: PAUSES.0,
+                linked_at: None,
+            };
+        }
+        is_deaf
     }
 }
 
@@ -245,6 +274,25 @@ mod tests {
         assert!(roll.due(start + s(40), |_| true).is_empty());
         assert!(roll.due(start + s(50), |e| *e == entry(1)).is_empty());
         assert_eq!(roll.due(start + s(52), |e| *e == entry(1)), [entry(2)]);
+    }
+
+    #[test]
+    fn a_link_without_a_token_is_given_up_and_made_anew() {
+        let start = Instant::now();
+        let two = Instance::new(0, 2);
+        let mut roll = Roll::new(Instance::new(0, 9));
+        roll.hear(call(2, &[]), start);
+        assert!(!roll.called(&two, true, start), "nobody misses it");
+        assert!(roll.due(start, |_| false).is_empty());
+        assert!(!roll.called(&two, true, start + s(2)));
+        assert!(!roll.called(&two, true, start + s(4)));
+        assert!(roll.called(&two, true, start + s(5)));
+        assert_eq!(roll.due(start + s(6), |_| false), [entry(2)]);
+        // A link that comes and goes is not deaf.
+        assert!(!roll.called(&two, true, start + s(6)));
+        assert!(!roll.called(&two, false, start + s(8)));
+        assert!(!roll.called(&two, true, start + s(10)));
+        assert!(!roll.called(&Instance::new(0, 3), true, start + s(60)));
     }
 
     #[test]

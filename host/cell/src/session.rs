@@ -27,17 +27,11 @@ use bumpless_core::{
 };
 use parking_lot::Mutex;
 use tokio::{runtime::Handle, sync::oneshot};
-use zenoh::{
-    Wait,
-    config::Locator,
-    internal::runtime::{Runtime, RuntimeBuilder, ZRuntime},
-    liveliness::LivelinessToken,
-    sample::Sample as Put,
-    session::ZenohId,
-};
+use zenoh::{Wait, liveliness::LivelinessToken, sample::Sample as Put};
 
 use crate::{
     arrival::Sink,
+    bus::{self, Bus},
     config::Config,
     counters::{Counters, count},
     error::Error,
@@ -66,8 +60,8 @@ pub(crate) struct Shared {
     locators: Vec<String>,
     /// None only while the last clone is being dropped.
     zenoh: Option<zenoh::Session>,
-    /// What the session runs on. Only this can be asked for a link.
-    runtime: Runtime,
+    /// What the session runs on.
+    bus: Bus,
 }
 
 /// A host's place on the bus. Clones are the same place.
@@ -103,7 +97,7 @@ impl Session {
 
     fn join(config: &Config, zenoh_config: zenoh::Config, sink: Sink, runtime: Handle) -> Result<Self, Error> {
         let host = config.host.clone();
-        let (zenoh, zenoh_runtime) = open(zenoh_config).map_err(|source| Error::Open {
+        let (zenoh, bus) = Bus::open(zenoh_config).map_err(|source| Error::Open {
             host: host.clone(),
             listen: config.listen.clone(),
             source,
@@ -112,7 +106,7 @@ impl Session {
         let inbox = Arc::new(Inbox::new(
             keys.clone(),
             host.clone(),
-            instance_of(zenoh.zid()),
+            bus::instance(zenoh.zid()),
             sink,
             runtime,
         ));
@@ -124,7 +118,7 @@ impl Session {
             token: Mutex::new(None),
             locators,
             zenoh: Some(zenoh),
-            runtime: zenoh_runtime,
+            bus,
         });
         // Set once, here: the error would be that it was set before.
         let _ = shared.inbox.shared.set(Arc::downgrade(&shared));
@@ -273,8 +267,8 @@ impl Session {
         let Ok(zenoh) = self.shared.zenoh().cloned() else {
             return;
         };
-        let runtime = self.shared.runtime.clone();
-        let closed = waiting(self.host(), move || close(&zenoh, &runtime)).await;
+        let bus = self.shared.bus.clone();
+        let closed = waiting(self.host(), move || bus.close(&zenoh)).await;
         match closed {
             Ok(Ok(())) => {}
             Ok(Err(error)) => tracing::debug!(host = %self.host(), %error, "the bus did not close cleanly"),
@@ -472,16 +466,19 @@ impl Shared {
         }
     }
 
-    /// Tries a link to a host. The attempt ends by Zenoh's own time-outs and is never dropped half-way: Zenoh would think it still
-    /// ran, and make no further one.
-    fn call(&self, entry: Entry) {
-        let locators: Vec<Locator> = entry.locators.iter().filter_map(|text| text.parse().ok()).collect();
-        let Some(id) = zenoh_id(&entry.instance) else { return };
-        let (runtime, own) = (self.runtime.clone(), self.inbox.host.clone());
-        drop(ZRuntime::Net.spawn(async move {
-            let met = runtime.connect_peer(&id.into(), &locators).await;
-            tracing::debug!(host = %own, called = %entry.host, at = ?entry.locators, met, "a host that was not met was called");
-        }));
+    /// Tries a link to a host, and closes one that is deaf.
+    fn call(self: &Arc<Self>, entry: Entry) {
+        let weak = Arc::downgrade(self);
+        let (instance, locators) = (entry.instance.clone(), entry.locators.clone());
+        self.bus.link(&instance, &locators, move |is_linked| {
+            let Some(shared) = weak.upgrade() else { return };
+            let is_deaf = shared.inbox.called(&entry.instance, is_linked);
+            let (host, called, at) = (&shared.inbox.host, &entry.host, &entry.locators);
+            tracing::debug!(%host, %called, ?at, is_linked, is_deaf, "a host that was not met was called");
+            if is_deaf {
+                shared.bus.unlink(&entry.instance);
+            }
+        });
     }
 
     pub(crate) fn warm(&self, host: &HostId) {
@@ -499,8 +496,8 @@ impl Drop for Shared {
     fn drop(&mut self) {
         // Zenoh waits while it closes, and panics if it has to do that on a single-threaded runtime.
         if let Some(zenoh) = self.zenoh.take() {
-            let runtime = self.runtime.clone();
-            let closing = move || drop(close(&zenoh, &runtime));
+            let bus = self.bus.clone();
+            let closing = move || drop(bus.close(&zenoh));
             drop(
                 std::thread::Builder::new()
                     .name("bumpless-bus".to_owned())
@@ -522,56 +519,4 @@ async fn waiting<T: Send + 'static>(host: &HostId, call: impl FnOnce() -> T + Se
         .spawn(call)
         .map_err(Error::Thread)?;
     receiver.await.map_err(|_| Error::Closed { host: host.clone() })
-}
-
-/// A session, and what it runs on: what `zenoh::open` does, in its order. That one keeps the second to itself.
-fn open(config: zenoh::Config) -> Result<(zenoh::Session, Runtime), zenoh::Error> {
-    ZRuntime::Application.block_in_place(async {
-        let mut runtime = RuntimeBuilder::new(config).build().await?;
-        let session = zenoh::session::init(runtime.clone().into()).await?;
-        runtime.start().await?;
-        Ok((session, runtime))
-    })
-}
-
-fn close(session: &zenoh::Session, runtime: &Runtime) -> Result<(), zenoh::Error> {
-    let said = session.close().wait();
-    runtime.close().wait()?;
-    said
-}
-
-/// The identity that an instance is made of; see [`instance_of`].
-fn zenoh_id(instance: &Instance) -> Option<ZenohId> {
-    let half = |digits: std::ops::Range<usize>| u64::from_str_radix(instance.as_str().get(digits)?, 16).ok();
-    let (high, low) = (half(0..16)?, half(16..32)?);
-    ZenohId::try_from([low.to_be_bytes(), high.to_be_bytes()].concat().as_slice()).ok()
-}
-
-/// One life: the random identity that Zenoh drew for the session.
-fn instance_of(id: ZenohId) -> Instance {
-    let (low, high) = id
-        .to_le_bytes()
-        .into_iter()
-        .enumerate()
-        .fold((0, 0), |(low, high), (place, byte)| {
-            if place < 8 {
-                (low << 8 | u64::from(byte), high)
-            } else {
-                (low, high << 8 | u64::from(byte))
-            }
-        });
-    Instance::new(high, low)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn an_instance_leads_back_to_its_identity() {
-        let id = ZenohId::default();
-        let life = instance_of(id);
-        assert_eq!(zenoh_id(&life), Some(id));
-        assert_eq!(zenoh_id(&Instance::new(0, 0)), None);
-    }
 }
