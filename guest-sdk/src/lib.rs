@@ -75,6 +75,7 @@ pub use io::{Cycle, Fault, Io, Level, Message, Mode, Priority, Quality, Reading}
 pub mod blocks;
 pub mod envelope;
 pub mod plant;
+pub mod program;
 
 #[doc(hidden)]
 pub mod glue;
@@ -84,6 +85,9 @@ pub mod bindings;
 
 #[doc(hidden)]
 pub mod plant_bindings;
+
+#[doc(hidden)]
+pub mod program_bindings;
 
 #[cfg(target_arch = "wasm32")]
 mod imports;

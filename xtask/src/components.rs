@@ -1,4 +1,4 @@
-//! Builds every controller (`controllers/*`) and every test guest (`tests/guests/*`) into a component.
+//! Builds every controller (`controllers/*`), plant, program (`programs/*`) and test guest (`tests/guests/*`) into a component.
 //!
 //! ```text
 //!   cargo build --target wasm32-unknown-unknown ─► core module ─► wit-component ─► check of imports ─► target/components
@@ -96,6 +96,8 @@ pub struct Built {
     pub guest: bool,
     /// Is it a simulated plant?
     pub plant: bool,
+    /// Is it a free-running program?
+    pub program: bool,
     /// Its size.
     pub bytes: u64,
     /// Its digest.
@@ -159,6 +161,7 @@ struct Source {
     name: String,
     guest: bool,
     plant: bool,
+    program: bool,
     any_import: bool,
 }
 
@@ -184,6 +187,8 @@ pub fn run() -> Result<(), Error> {
             format!("guests/{}", c.name)
         } else if c.plant {
             format!("plants/{}", c.name)
+        } else if c.program {
+            format!("programs/{}", c.name)
         } else {
             c.name.clone()
         };
@@ -197,7 +202,7 @@ pub fn build_all() -> Result<(PathBuf, Vec<Built>), Error> {
     let metadata = metadata()?;
     let sources = sources(&metadata);
     let folder = metadata.target_directory.join("components");
-    for inner in ["guests", "plants"].map(|name| folder.join(name)) {
+    for inner in ["guests", "plants", "programs"].map(|name| folder.join(name)) {
         fs::create_dir_all(&inner).map_err(|source| Error::File {
             path: inner.clone(),
             action: "written",
@@ -259,7 +264,7 @@ fn metadata() -> Result<Metadata, Error> {
     serde_json::from_slice(&text).map_err(Error::Message)
 }
 
-/// The crates with a `cdylib` under `controllers`, `plants` and `tests/guests`, in this order, by name.
+/// The crates with a `cdylib` under `controllers`, `plants`, `programs` and `tests/guests`, in this order, by name.
 fn sources(metadata: &Metadata) -> Vec<Source> {
     let mut sources: Vec<Source> = metadata
         .packages
@@ -273,18 +278,20 @@ fn sources(metadata: &Metadata) -> Vec<Source> {
             let component = p.metadata.as_ref().and_then(|m| m.component.as_ref());
             let any_import = component.is_some_and(|c| c.imports == Imports::Any);
             let plant = place == Path::new("plants");
-            let ours = guest || plant || place == Path::new("controllers");
+            let program = place == Path::new("programs");
+            let ours = guest || plant || program || place == Path::new("controllers");
             ours.then(|| Source {
                 id: p.id.clone(),
                 package: p.name.clone(),
                 name,
                 guest,
                 plant,
+                program,
                 any_import,
             })
         })
         .collect();
-    sources.sort_by(|a, b| (a.guest, a.plant, &a.name).cmp(&(b.guest, b.plant, &b.name)));
+    sources.sort_by(|a, b| (a.guest, a.plant, a.program, &a.name).cmp(&(b.guest, b.plant, b.program, &b.name)));
     sources
 }
 
@@ -360,6 +367,8 @@ fn componentize(source: &Source, modules: &[(String, PathBuf, bool)], folder: &P
         folder.join("guests").join(file)
     } else if source.plant {
         folder.join("plants").join(file)
+    } else if source.program {
+        folder.join("programs").join(file)
     } else {
         folder.join(file)
     };
@@ -374,6 +383,7 @@ fn componentize(source: &Source, modules: &[(String, PathBuf, bool)], folder: &P
         path,
         guest: source.guest,
         plant: source.plant,
+        program: source.program,
         bytes: bytes.len() as u64,
         digest,
     })
@@ -470,7 +480,7 @@ mod tests {
         let (folder, first) = build_all().expect("components build");
         let names: Vec<&str> = first
             .iter()
-            .filter(|c| !c.guest && !c.plant)
+            .filter(|c| !c.guest && !c.plant && !c.program)
             .map(|c| c.name.as_str())
             .collect();
         assert_eq!(

@@ -16,12 +16,17 @@ use crate::{
 const PACKAGE: &str = "bumpless:control/";
 /// Interfaces of `bumpless:control` that a controller may import, by their short names. There are no others.
 pub const INTERFACES: [&str; 6] = ["types", "io", "timer", "net", "alarm", "log"];
+/// Interfaces of `bumpless:control` that a program may import, by their short names.
+pub const PROGRAM_INTERFACES: [&str; 7] = ["types", "points", "clock", "topics", "components", "checkpoint", "log"];
 /// The interface that it must export, with its functions.
 const EXPORT: &str = "bumpless:control/control@0.1.0";
 const FUNCTIONS: [&str; 4] = ["describe", "start", "step", "migrate"];
 /// The interface that a plant must export, with its functions.
 const PLANT_EXPORT: &str = "bumpless:control/process@0.1.0";
 const PLANT_FUNCTIONS: [&str; 3] = ["describe-plant", "begin", "advance"];
+/// The interface that a program must export, with its functions.
+pub(crate) const PROGRAM_EXPORT: &str = "bumpless:control/free-run@0.1.0";
+const PROGRAM_FUNCTIONS: [&str; 2] = ["describe-program", "run"];
 
 /// What an inspection found: a controller that can be prepared on this host.
 #[derive(Debug, Clone, PartialEq)]
@@ -71,13 +76,22 @@ pub(crate) fn check_bytes(bytes: &[u8], limits: &Limits) -> Result<(), Error> {
 
 /// Names every import, and refuses those that are not offered.
 pub(crate) fn check_imports(component: &Component) -> Result<Vec<String>, Error> {
+    check_imports_of(component, &INTERFACES)
+}
+
+/// As [`check_imports`], for a program.
+pub(crate) fn check_program_imports(component: &Component) -> Result<Vec<String>, Error> {
+    check_imports_of(component, &PROGRAM_INTERFACES)
+}
+
+fn check_imports_of(component: &Component, offered: &[&str]) -> Result<Vec<String>, Error> {
     let ty = component.component_type();
     let mut names = Vec::new();
     for (name, _) in ty.imports(component.engine()) {
         let interface = name
             .strip_prefix(PACKAGE)
             .map(|rest| rest.split('@').next().unwrap_or(rest));
-        if !interface.is_some_and(|i| INTERFACES.contains(&i)) {
+        if !interface.is_some_and(|i| offered.contains(&i)) {
             return Err(Error::Import {
                 name: name.chars().take(128).collect(),
                 cure: cure(name),
@@ -106,6 +120,11 @@ pub(crate) fn check_export(component: &Component) -> Result<(), Error> {
 /// As [`check_export`], for a plant.
 pub(crate) fn check_plant_export(component: &Component) -> Result<(), Error> {
     check_interface(component, PLANT_EXPORT, &PLANT_FUNCTIONS).map_err(|reason| Error::PlantWorld { reason })
+}
+
+/// As [`check_export`], for a program.
+pub(crate) fn check_program_export(component: &Component) -> Result<(), Error> {
+    check_interface(component, PROGRAM_EXPORT, &PROGRAM_FUNCTIONS).map_err(|reason| Error::ProgramWorld { reason })
 }
 
 fn check_interface(component: &Component, export: &str, functions: &[&str]) -> Result<(), String> {

@@ -14,7 +14,7 @@ use bumpless_core::Digest;
 use wasmtime::component::Component;
 
 use crate::{
-    Capacity, Config, Error, Inspection, Prepared, PreparedPlant, Profile,
+    Capacity, Config, Error, Inspection, Prepared, PreparedPlant, PreparedProgram, Profile, Programs,
     admission::{check_bytes, check_plant_export},
     cache::{Cache, deserialize},
     capacity::{Places, Turnstile},
@@ -40,6 +40,7 @@ struct Shared {
     compile: Compile,
     /// One compilation at a time: each may take gigabytes.
     compilations: Turnstile,
+    programs: Programs,
     prepared: Mutex<HashMap<Digest, Arc<Prepared>>>,
 }
 
@@ -50,6 +51,8 @@ pub enum Either {
     Controller(Inspection, Arc<Prepared>),
     /// What simulated buses run, and how long its compilation took where there was one.
     Plant(Arc<PreparedPlant>, Option<Duration>),
+    /// What runs freely, and how long its compilation took where there was one.
+    Program(Arc<PreparedProgram>, Option<Duration>),
 }
 
 impl Engine {
@@ -60,6 +63,7 @@ impl Engine {
     /// [`Error::Engine`] and [`Error::Thread`] where the machine refuses, [`Error::File`] for the cache's folder.
     pub fn new(config: Config) -> Result<Self, Error> {
         check(&config)?;
+        let programs = Programs::new(&config)?;
         let Config {
             cache_dir,
             cache_key,
@@ -97,6 +101,7 @@ impl Engine {
             cache,
             compile,
             compilations: Turnstile::new(1, "compiled"),
+            programs,
             prepared: Mutex::default(),
         })))
     }
@@ -177,6 +182,12 @@ impl Engine {
         self.0.profile
     }
 
+    /// The engine of free-running programs.
+    #[must_use]
+    pub fn programs(&self) -> &Programs {
+        &self.0.programs
+    }
+
     /// Makes a simulated plant ready for instances, from the cache or the compiler. It takes no place among the prepared
     /// components: a plant is used by one bus or one experiment, which keeps what this gives.
     ///
@@ -187,7 +198,7 @@ impl Engine {
         Ok(Arc::new(plant))
     }
 
-    /// A component of either world, ready for a trial: what somebody uploads says itself what it is. `imports` are those of
+    /// A component of any world, ready for a trial: what somebody uploads says itself what it is. `imports` are those of
     /// its own list.
     ///
     /// # Errors
@@ -196,6 +207,13 @@ impl Engine {
         enum Made {
             Controller(Prepared),
             Plant(PreparedPlant),
+        }
+        if Programs::is_likely(bytes) {
+            match self.0.programs.open(bytes) {
+                // A controller that only speaks of programs.
+                Err(Error::ProgramWorld { .. } | Error::Import { .. }) => {}
+                opened => return opened.map(|(program, compile_time)| Either::Program(program, compile_time)),
+            }
         }
         let new = |core: Arc<Core>, digest, component: &Component| {
             if check_plant_export(component).is_ok() {

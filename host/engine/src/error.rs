@@ -53,6 +53,24 @@ pub enum Error {
         /// What, and how it should be.
         reason: String,
     },
+    /// Imports or exports do not fit the world of programs.
+    #[error("this is no program of the world bumpless:control@0.1.0: {reason}")]
+    ProgramWorld {
+        /// Which import or export, and how it differs.
+        reason: String,
+    },
+    /// What a program says of itself makes no sense.
+    #[error("what the program says of itself is not acceptable: {reason}")]
+    ProgramInfo {
+        /// What, and how it should be.
+        reason: String,
+    },
+    /// A script that cannot ride in a component.
+    #[error("the script cannot be taken: {reason}")]
+    Script {
+        /// What, and how it should be.
+        reason: String,
+    },
     /// More core instances, memories or tables than one component may have, or a first memory over the limit.
     #[error("the component needs more than an instance may have: {reason}")]
     Needs {

@@ -12,6 +12,8 @@
 //! ```
 //!
 //! A simulated plant goes the same way with its own world: `open_plant`, then `instantiate`, `begin`, `advance` (`plant`).
+//! A free-running program has an engine of its own (`programs`), and runs as a future (`program`); a script rides in its
+//! interpreter's bytes (`script`).
 //!
 //! Reading order: `config`, `engine`, `admission`, `prepared`, `instance`; below them `profile`, `compile` with
 //! `compile_child`, `cache`, `ticker`, `sandbox`, `imports`; `convert` alone joins generated types and the core's nouns.
@@ -32,10 +34,14 @@ mod plant;
 mod plant_bindings;
 mod prepared;
 mod profile;
+mod program;
+mod program_bindings;
+mod programs;
 mod sandbox;
+mod script;
 mod ticker;
 
-pub use admission::{INTERFACES, Inspection};
+pub use admission::{INTERFACES, Inspection, PROGRAM_INTERFACES};
 pub use cache::cache_key;
 pub use capacity::Capacity;
 pub use compile::precompile;
@@ -46,6 +52,11 @@ pub use instance::{Instance, Origin};
 pub use plant::{PlantInfo, PlantInstance, PlantRole, PlantSignal, PlantView, PreparedPlant};
 pub use prepared::Prepared;
 pub use profile::Profile;
+pub use program::{
+    Answer, Later, PreparedProgram, ProgramInfo, ProgramSlot, Question, Reply, Sight, Surroundings, Turn, Usage,
+};
+pub use programs::Programs;
+pub use script::{SCRIPT_BYTES_MAX, Script, split, wrap};
 
 // Instances are stepped by whichever worker has the turn; the rest is shared by all of them.
 const _: () = {
@@ -56,4 +67,6 @@ const _: () = {
     shared::<PreparedPlant>();
     shared::<Engine>();
     shared::<Prepared>();
+    shared::<PreparedProgram>();
+    shared::<Programs>();
 };

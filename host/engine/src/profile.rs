@@ -1,4 +1,4 @@
-//! How wasmtime is set up: one cyclic profile in two shapes of memory.
+//! How wasmtime is set up: the cyclic profile in two shapes of memory, and the profile of programs.
 //!
 //! Owns: every wasmtime setting with its reason, and the choice between the shapes by what the kernel allows.
 //! Never: differs between the host and its compiling child, for compiled code only loads where the settings agree.
@@ -36,8 +36,13 @@ const SPARE_INSTANCES: u32 = INSPECTED_AT_ONCE + TRIAL_INSTANCES;
 
 /// Stack of a guest in bytes; a thread that steps must have 1 MiB or more in all.
 const STACK_BYTES_MAX: usize = 256 * 1024;
+/// Stack of a program in bytes: an interpreter calls itself for each call of its script.
+const PROGRAM_STACK_BYTES_MAX: usize = 512 * 1024;
+/// Stack of a program's fiber in bytes: its own, and as much for what the host does in its calls. Only what was touched is in
+/// RAM.
+const PROGRAM_FIBER_BYTES: usize = 1024 * 1024;
 
-/// The two shapes of memory. Code compiled for one does not load in the other.
+/// The two shapes of memory of cyclic components, and what programs run under. Code compiled for one does not load in another.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Profile {
     /// Slots reserved at start, up to 14,000 instances. A small Rust component takes about 40 KiB per instance.
@@ -45,6 +50,9 @@ pub enum Profile {
     /// Memory allocated and cleared with each instance: next to no memory maps, so instances by the ten thousand, but all
     /// of a guest's first memory is in RAM from its start: about 85 KiB for the same component.
     OnDemand,
+    /// Free-running programs: as [`Profile::OnDemand`], with a stack for an interpreter, and on fibers, so that a program that
+    /// waits needs no thread. An engine of its own: nothing of it can slow a controller's call.
+    Program,
 }
 
 impl Profile {
@@ -54,13 +62,16 @@ impl Profile {
         match self {
             Self::Pooled => "pooled",
             Self::OnDemand => "on-demand",
+            Self::Program => "program",
         }
     }
 
     /// The profile of that name.
     #[must_use]
     pub fn named(name: &str) -> Option<Self> {
-        [Self::Pooled, Self::OnDemand].into_iter().find(|p| p.name() == name)
+        [Self::Pooled, Self::OnDemand, Self::Program]
+            .into_iter()
+            .find(|p| p.name() == name)
     }
 
     /// The shape for so many instances under the kernel's limit on memory maps, or an error where neither fits.
@@ -124,13 +135,18 @@ impl Profile {
                     .memory_reservation_for_growth(0);
             }
             // Plain allocations without guards, so that memory maps stay few.
-            Self::OnDemand => {
+            Self::OnDemand | Self::Program => {
                 config
                     .memory_may_move(true)
                     .memory_reservation(0)
                     .memory_guard_size(0)
                     .memory_reservation_for_growth(0);
             }
+        }
+        if self == Self::Program {
+            config
+                .max_wasm_stack(PROGRAM_STACK_BYTES_MAX)
+                .async_stack_size(PROGRAM_FIBER_BYTES);
         }
         config
     }
@@ -241,7 +257,7 @@ mod tests {
 
     #[test]
     fn names_lead_back() {
-        for profile in [Profile::Pooled, Profile::OnDemand] {
+        for profile in [Profile::Pooled, Profile::OnDemand, Profile::Program] {
             assert_eq!(Profile::named(profile.name()), Some(profile));
         }
         assert_eq!(Profile::named("winch"), None);
