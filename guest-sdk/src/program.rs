@@ -107,7 +107,7 @@ macro_rules! export_program {
                 }
             }
 
-            $crate::program_bindings::export_program_component!(Component with_types_in $crate::program_bindings);
+    $crate::program_bindings::export_program_component!(Component with_types_in $crate::program_bindings);
         };
     };
 }

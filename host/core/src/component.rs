@@ -33,6 +33,9 @@ pub const CONTROLLER_WORLD: &str = "bumpless:control/controller@0.1.0";
 /// The world of a plant: what a simulated bus and an experiment run.
 pub const PLANT_WORLD: &str = "bumpless:control/plant@0.1.0";
 
+/// The world of a free-running program.
+pub const PROGRAM_WORLD: &str = "bumpless:control/program@0.1.0";
+
 /// One thing that happened to a component in the library.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ComponentEvent {
@@ -171,7 +174,9 @@ impl ComponentInfo {
     /// # Errors
     /// The first thing that does not hold.
     pub fn check(&self) -> Result<(), ComponentInfoError> {
-        if self.is_plant() {
+        if self.is_program() {
+            self.descriptor.check_program()?;
+        } else if self.is_plant() {
             self.descriptor.check_plant()?;
         } else {
             self.descriptor.check()?;
@@ -219,6 +224,12 @@ impl ComponentInfo {
     #[must_use]
     pub fn is_plant(&self) -> bool {
         self.world == PLANT_WORLD
+    }
+
+    /// Is it a free-running program?
+    #[must_use]
+    pub fn is_program(&self) -> bool {
+        self.world == PROGRAM_WORLD
     }
 
     /// How new this copy is.

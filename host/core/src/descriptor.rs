@@ -210,6 +210,14 @@ impl Descriptor {
         self.check_parts(true)
     }
 
+    /// As [`Descriptor::check`], for a free-running program, which has neither ports nor parameters.
+    ///
+    /// # Errors
+    /// As [`Descriptor::check`].
+    pub fn check_program(&self) -> Result<(), DescriptorError> {
+        self.check_parts(false)
+    }
+
     fn check_parts(&self, dots: bool) -> Result<(), DescriptorError> {
         short_name("component name", &self.name)?;
         let version_parts: Vec<&str> = self.version.split('.').collect();

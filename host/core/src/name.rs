@@ -136,6 +136,11 @@ name_type!(
     "loop"
 );
 name_type!(
+    /// A free-running program.
+    ProgramId,
+    "program"
+);
+name_type!(
     /// One named I/O value. Unique in the cell.
     PointId,
     "point"

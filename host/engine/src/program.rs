@@ -259,9 +259,18 @@ impl PreparedProgram {
         checkpoint: Option<Vec<u8>>,
     ) -> Result<(), Fault> {
         let code = &self.code;
-        let _place = code.shared.places.take().map_err(|error| Fault::Limit(error.to_string()))?;
+        let _place = code
+            .shared
+            .places
+            .take()
+            .map_err(|error| Fault::Limit(error.to_string()))?;
         let memory_bytes_max = memory_bytes_max.min(code.shared.limits.memory_bytes_max);
-        let ground = Ground::new(surroundings, Arc::clone(&usage), memory_bytes_max, code.shared.limits.table_elements_max);
+        let ground = Ground::new(
+            surroundings,
+            Arc::clone(&usage),
+            memory_bytes_max,
+            code.shared.limits.table_elements_max,
+        );
         let work = Box::pin(async {
             let mut store = code.store(ground);
             let guest = match code.pre.instantiate_async(&mut store).await {
@@ -380,7 +389,9 @@ impl Ground {
         let slots = self.surroundings.slots().len();
         match usize::try_from(slot) {
             Ok(number) if number < slots => Ok(number),
-            _ => stop(Fault::Failed(format!("slot {slot} is not there: the program is granted {slots} points"))),
+            _ => stop(Fault::Failed(format!(
+                "slot {slot} is not there: the program is granted {slots} points"
+            ))),
         }
     }
 }
@@ -418,7 +429,9 @@ impl points::Host for Ground {
     async fn write(&mut self, slot: u32, value: f64) -> wasmtime::Result<Result<(), String>> {
         let slot = self.slot(slot)?;
         if !value.is_finite() {
-            return stop(Fault::Failed(format!("it wrote {value} to a point; a value must be a finite number")));
+            return stop(Fault::Failed(format!(
+                "it wrote {value} to a point; a value must be a finite number"
+            )));
         }
         let writable = self.surroundings.slots().get(slot).is_some_and(|slot| slot.writable);
         if !writable {
@@ -495,7 +508,10 @@ impl topics::Host for Ground {
 }
 
 impl components::Host for Ground {
-    async fn step(&mut self, question: components::Question) -> wasmtime::Result<Result<components::Answer, types::Fault>> {
+    async fn step(
+        &mut self,
+        question: components::Question,
+    ) -> wasmtime::Result<Result<components::Answer, types::Fault>> {
         let pairs = |values: Vec<components::Value>| values.into_iter().map(|v| (v.name, v.value)).collect();
         let question = Question {
             component: question.component,
@@ -552,7 +568,9 @@ impl ResourceLimiter for Ground {
         if fits {
             self.usage.memory_bytes.store(desired as u64, Ordering::Relaxed);
         } else {
-            self.refused = Some(format!("it asked for {desired} bytes of memory; at most {max} are given"));
+            self.refused = Some(format!(
+                "it asked for {desired} bytes of memory; at most {max} are given"
+            ));
         }
         Ok(fits)
     }
@@ -561,7 +579,9 @@ impl ResourceLimiter for Ground {
         let max = self.table_elements_max;
         let fits = desired <= max;
         if !fits {
-            self.refused = Some(format!("it asked for a table of {desired} elements; at most {max} are given"));
+            self.refused = Some(format!(
+                "it asked for a table of {desired} elements; at most {max} are given"
+            ));
         }
         Ok(fits)
     }

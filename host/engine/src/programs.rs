@@ -95,7 +95,15 @@ impl Programs {
         let cache = config
             .cache_dir
             .as_ref()
-            .map(|dir| Cache::open(dir.join("programs"), config.cache_key, limits.cached_max, &engine, Profile::Program))
+            .map(|dir| {
+                Cache::open(
+                    dir.join("programs"),
+                    config.cache_key,
+                    limits.cached_max,
+                    &engine,
+                    Profile::Program,
+                )
+            })
             .transpose()?;
         let mut linker = Linker::new(&engine);
         Program::add_to_linker::<_, HasSelf<Ground>>(&mut linker, |ground| ground)
@@ -174,7 +182,10 @@ impl Programs {
         if let Some(code) = self.in_use(&digest) {
             return Ok((code, None));
         }
-        let cached = own.cache.as_ref().and_then(|cache| cache.load(&digest, &own.shared.engine));
+        let cached = own
+            .cache
+            .as_ref()
+            .and_then(|cache| cache.load(&digest, &own.shared.engine));
         let (code, compile_time) = match cached {
             Some(component) => (Code::new(&own.shared, &component)?, None),
             None => {
@@ -244,7 +255,12 @@ fn describe(shared: &Shared, pre: &ProgramPre<Ground>) -> Result<ProgramInfo, Er
     let nowhere = Arc::new(Nowhere {
         limit_ns: nanos(limits.describe_time_max),
     });
-    let ground = Ground::new(nowhere, Arc::clone(&usage), limits.memory_bytes_max, limits.table_elements_max);
+    let ground = Ground::new(
+        nowhere,
+        Arc::clone(&usage),
+        limits.memory_bytes_max,
+        limits.table_elements_max,
+    );
     let asked = Metered {
         work: Box::pin(async {
             let mut store = store(&shared.engine, ground);
@@ -252,7 +268,11 @@ fn describe(shared: &Shared, pre: &ProgramPre<Ground>) -> Result<ProgramInfo, Er
                 Ok(guest) => guest,
                 Err(error) => return Err(Error::Instantiate(store.data().fault(&error))),
             };
-            match guest.bumpless_control_free_run().call_describe_program(&mut store).await {
+            match guest
+                .bumpless_control_free_run()
+                .call_describe_program(&mut store)
+                .await
+            {
                 Ok(said) => Ok(ProgramInfo {
                     name: said.name,
                     version: said.version,

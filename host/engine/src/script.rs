@@ -161,7 +161,9 @@ mod tests {
         }
         let error = wrap(&wrapped, &script(b"y")).unwrap_err().to_string();
         assert!(error.contains("has a script in it already"), "{error}");
-        let error = wrap(EMPTY, &script(&vec![0; SCRIPT_BYTES_MAX + 1])).unwrap_err().to_string();
+        let error = wrap(EMPTY, &script(&vec![0; SCRIPT_BYTES_MAX + 1]))
+            .unwrap_err()
+            .to_string();
         assert!(error.contains("at most 262144"), "{error}");
     }
 }

@@ -45,7 +45,9 @@ fn run(script: &[u8], checkpoint: Option<Vec<u8>>) -> Result<(), Fault> {
     }
     // Compiled code could be made to do anything to the interpreter.
     if script.starts_with(b"\x1bLua") {
-        return Err(Fault::BadParameter("this is compiled Lua: upload the script itself".to_owned()));
+        return Err(Fault::BadParameter(
+            "this is compiled Lua: upload the script itself".to_owned(),
+        ));
     }
     let libraries = StdLib::BASE | StdLib::STRING | StdLib::TABLE | StdLib::MATH | StdLib::COROUTINE;
     let mut lua = Lua::new_with(libraries).map_err(|error| Fault::Failed(error.to_string()))?;

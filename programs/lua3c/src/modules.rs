@@ -5,7 +5,11 @@
 
 use std::cell::RefCell;
 
-use rilua::{Lua, LuaApiMut as _, LuaResult, RustFn, Val, runtime_error, vm::closure::{Closure, RustClosure}, vm::state::LuaState};
+use rilua::{
+    Lua, LuaApiMut as _, LuaResult, RustFn, Val, runtime_error,
+    vm::closure::{Closure, RustClosure},
+    vm::state::LuaState,
+};
 
 use crate::board;
 
@@ -64,7 +68,12 @@ pub(crate) fn open(lua: &mut Lua, checkpoint: Option<Vec<u8>>) -> LuaResult<()> 
     RUN.with(|run| *run.borrow_mut() = Run { pins, checkpoint });
     let hardware: [(&str, RustFn); 4] = [("aIn", a_in), ("aOut", a_out), ("dIn", d_in), ("dOut", d_out)];
     let names = ["naIn", "naOut", "ndIn", "ndOut"];
-    module(lua, "h3c", &hardware, &names.into_iter().zip(counts).collect::<Vec<_>>())?;
+    module(
+        lua,
+        "h3c",
+        &hardware,
+        &names.into_iter().zip(counts).collect::<Vec<_>>(),
+    )?;
     let network: [(&str, RustFn); 4] = [("tx", tx), ("listen", listen), ("clearAll", clear_all), ("rx", rx)];
     module(lua, "n3c", &network, &[])?;
     let system: [(&str, RustFn); 3] = [("dms", dms), ("dus", dus), ("ems", ems)];
@@ -107,7 +116,9 @@ fn number(state: &LuaState, place: usize) -> LuaResult<i64> {
     if (0..=NUMBER_MAX).contains(&number) {
         return Ok(number);
     }
-    Err(runtime_error(format!("bad argument #{place}: {number} is no number of a pin or an id")))
+    Err(runtime_error(format!(
+        "bad argument #{place}: {number} is no number of a pin or an id"
+    )))
 }
 
 fn slot(state: &LuaState, kind: Kind) -> LuaResult<Option<u32>> {
@@ -137,7 +148,9 @@ fn output(state: &mut LuaState, kind: Kind) -> LuaResult<u32> {
         _ => value,
     };
     if !value.is_finite() {
-        return Err(runtime_error(format!("bad argument #2: {value} cannot be put on a pin")));
+        return Err(runtime_error(format!(
+            "bad argument #2: {value} cannot be put on a pin"
+        )));
     }
     match slot.map_or(Ok(()), |slot| board::write(slot, value)) {
         Ok(()) => Ok(0),

@@ -60,7 +60,10 @@ impl Tank {
 
 #[test]
 fn the_central_script_holds_the_level_through_its_published_steps() {
-    let mut tank = Tank { level: 23.0, last_ns: 0 };
+    let mut tank = Tank {
+        level: 23.0,
+        last_ns: 0,
+    };
     let (mut seen, mut n) = (Vec::new(), 0_u64);
     let record = std::rc::Rc::new(std::cell::RefCell::new(Vec::new()));
     let out = std::rc::Rc::clone(&record);
@@ -142,7 +145,13 @@ fn pins_are_counted_and_open_ones_read_as_open() {
         print(h3c.aIn(0), h3c.aIn(5), h3c.dIn(1), h3c.dIn(9))
         print(select('#', h3c.aOut(3, 7)), (h3c.aIn(2)))
         h3c.dOut(17, true) h3c.dOut(17, h3c.dIn(1))";
-    let slots = [("ain-0", f64::NAN), ("ain-2", 4.5), ("din-1", 2.0), ("dout-17", 0.0), ("other", 1.0)];
+    let slots = [
+        ("ain-0", f64::NAN),
+        ("ain-2", 4.5),
+        ("din-1", 2.0),
+        ("dout-17", 0.0),
+        ("other", 1.0),
+    ];
     let (ended, board) = on(board(&slots), None, script);
     assert_eq!(ended, Ok(()));
     assert_eq!(board.lines, ["3\t0\t2\t18", "0\t0\t1\t1\ttrue", "0\t4.5"]);
@@ -165,7 +174,14 @@ fn messages_keep_their_kind_and_checkpoints_their_bytes() {
     assert_eq!(ended, Ok(()));
     assert_eq!(
         board.lines,
-        ["7\tnumber\t1.5", "7\tboolean\ttrue", "7\tstring\tx", "7\tstring\t12", "7\tstring\ttrue", "7\tstring\t\"q"]
+        [
+            "7\tnumber\t1.5",
+            "7\tboolean\ttrue",
+            "7\tstring\tx",
+            "7\tstring\t12",
+            "7\tstring\ttrue",
+            "7\tstring\t\"q"
+        ]
     );
 }
 
@@ -174,5 +190,8 @@ fn a_refused_write_is_told_and_the_script_goes_on() {
     let mut refusing = board(&[("aout-0", 1.0)]);
     refusing.refusal = Some("a person forces it".to_owned());
     let (ended, board) = on(refusing, None, b"local ok, why = h3c.aOut(0, 2) print(ok, why)");
-    assert_eq!((ended, board.lines), (Ok(()), vec!["false\ta person forces it".to_owned()]));
+    assert_eq!(
+        (ended, board.lines),
+        (Ok(()), vec!["false\ta person forces it".to_owned()])
+    );
 }

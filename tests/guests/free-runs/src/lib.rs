@@ -53,7 +53,10 @@ impl Program for FreeRuns {
                 for edge in 0..edges {
                     points::write(out, (edge & 1) as f64).map_err(Fault::Failed)?;
                 }
-                log(Level::Info, &format!("{edges} edges in {} ns", clock::now_ns() - from_ns));
+                log(
+                    Level::Info,
+                    &format!("{edges} edges in {} ns", clock::now_ns() - from_ns),
+                );
                 Ok(())
             }
             "copy" => {
@@ -84,8 +87,14 @@ impl Program for FreeRuns {
                     component: "pid".into(),
                     parameters: vec![],
                     state: None,
-                    inputs: vec![components::Value { name: "pv".into(), value: 40.0 }],
-                    track: vec![components::Value { name: "out".into(), value: 10.0 }],
+                    inputs: vec![components::Value {
+                        name: "pv".into(),
+                        value: 40.0,
+                    }],
+                    track: vec![components::Value {
+                        name: "out".into(),
+                        value: 10.0,
+                    }],
                     setpoint: 50.0,
                     mode: bumpless_sdk::program::Mode::Automatic,
                     dt_ns: 100_000_000,
