@@ -35,6 +35,7 @@ const ROOMS: [(&str, &[&str]); 36] = [
             "bumpless-cell",
             "bumpless-store",
             "bumpless-loops",
+            "bumpless-programs",
         ],
     ),
     ("bumpless-api", &["bumpless-core", "bumpless-deploy"]),
@@ -74,6 +75,8 @@ const ROOMS: [(&str, &[&str]); 36] = [
     ("bumpless-ratio", &["bumpless-isa", "bumpless-sdk"]),
     ("bumpless-smith", &["bumpless-isa", "bumpless-sdk"]),
     ("bumpless-split-range", &["bumpless-isa", "bumpless-sdk"]),
+    ("bumpless-programs", &["bumpless-core", "bumpless-engine"]),
+    ("lua3c", &["bumpless-sdk"]),
     ("plant-fopdt", &["bumpless-sdk"]),
     ("plant-integrating", &["bumpless-sdk"]),
     ("plant-quadruple-tank", &["bumpless-sdk"]),
@@ -109,6 +112,7 @@ const CONFINED: [(&str, &[&str]); 14] = [
             "bumpless-deploy",
             "bumpless-api",
             "bumpless-scada",
+            "bumpless-programs",
             "bumpless-app",
             "bumpless-bench",
         ],
@@ -130,13 +134,15 @@ const DATES: [&str; 8] = [
 ];
 
 /// Where `unsafe` is: the loading of compiled code, one system call, and the canonical ABI of guests.
-const UNSAFE: [&str; 8] = [
+const UNSAFE: [&str; 10] = [
     "host/app/src/realtime.rs",
     "host/engine/src/cache.rs",
     "guest-sdk/src/bindings.rs",
     "guest-sdk/src/lib.rs",
     "guest-sdk/src/plant.rs",
     "guest-sdk/src/plant_bindings.rs",
+    "guest-sdk/src/program.rs",
+    "guest-sdk/src/program_bindings.rs",
     "tests/guests/forbidden-import/src/lib.rs",
     "tests/guests/wrong-world/src/lib.rs",
 ];

@@ -21,6 +21,7 @@
 //! | refusals | bad components, loops, requests, configurations, command lines |
 //! | audit | every change leaves its entry; kill -9, tampering |
 //! | webhooks | alarms told to a receiver that is slow, away, back; and to readers at any host |
+//! | programs | free-running programs: paused while they spin, kill -9 of their owner; the published 3C scripts |
 //! | votes | a host whose steps come out wrong, and who notices |
 //! | modbus | a real Modbus device that dies and comes back |
 //! | scada | the cell as a Modbus device: points of another host, commands to a loop |
@@ -61,6 +62,7 @@ mod modbus;
 mod neighbours;
 mod past;
 mod phases;
+mod programs;
 mod recovery;
 mod refusals;
 mod restarts;

@@ -31,6 +31,7 @@ mod notices;
 mod once;
 mod openapi;
 mod paging;
+mod program;
 #[allow(
     unused_qualifications,
     reason = "utoipa writes `super::` before the query types of the routes"

@@ -10,7 +10,7 @@ use crate::{
     error::Problem,
     routes::{
         alarms, audit, bundle, components, demo, field, health, history, hosts, lab, live, load, loops, pages, past,
-        rollouts, trend,
+        programs, rollouts, trend,
     },
     types,
 };
@@ -29,6 +29,8 @@ use crate::{
         loops::setpoint, loops::mode, loops::output,
         history::cycles, past::of_loop, past::of_point, history::replay, history::backtest,
         history::start_shadow, history::shadows, history::show_shadow, history::stop_shadow,
+        programs::create, programs::list, programs::show, programs::order, programs::remove, programs::log, programs::checkpoint,
+        programs::script,
         rollouts::start, rollouts::list, rollouts::show, rollouts::stop,
         alarms::list, alarms::past, alarms::show, alarms::act, alarms::define, alarms::remove,
         load::metrics, load::webhooks, audit::list, audit::verify, audit::export,
@@ -43,6 +45,7 @@ use crate::{
         (name = "loops", description = "Controllers bound to points"),
         (name = "commands", description = "What an operator asks of a running loop; answered when a committed record holds it"),
         (name = "history", description = "Looking back: recorded cycles, years of thinned history, replays, and candidates tried on them or beside a running loop"),
+        (name = "programs", description = "Free-running programs and scripts: started, paused, resumed and stopped at any instruction"),
         (name = "rollouts", description = "One component for many loops: one loop first, then the rest by rule"),
         (name = "alarms", description = "What stands, what happened, and what people do about it, by ANSI/ISA-18.2"),
         (name = "audit", description = "Who changed what: a chain of entries on each host, listed, verified, exported"),

@@ -18,6 +18,7 @@ pub(crate) mod loops;
 pub(crate) mod page;
 pub(crate) mod pages;
 pub(crate) mod past;
+pub(crate) mod programs;
 pub(crate) mod rollouts;
 pub(crate) mod trend;
 
@@ -40,6 +41,7 @@ pub(crate) fn all() -> Router<App> {
         )
         .route("/v1/bundle", get(bundle::export).post(bundle::import))
         .route("/v1/components/{reference}/bytes", get(components::bytes))
+        .route("/v1/components/{reference}/script", get(programs::script))
         .route("/v1/components/{reference}/call", post(components::call))
         .route("/v1/loops", get(loops::list))
         .route(
@@ -69,6 +71,11 @@ pub(crate) fn all() -> Router<App> {
         .route("/v1/rollouts", get(rollouts::list).post(rollouts::start))
         .route("/v1/rollouts/{id}", get(rollouts::show))
         .route("/v1/rollouts/{id}/stop", post(rollouts::stop))
+        .route("/v1/programs", get(programs::list).post(programs::create))
+        .route("/v1/programs/{name}", get(programs::show).delete(programs::remove))
+        .route("/v1/programs/{name}/order", post(programs::order))
+        .route("/v1/programs/{name}/log", get(programs::log))
+        .route("/v1/programs/{name}/checkpoint", get(programs::checkpoint))
         .route("/v1/alarms", get(alarms::list))
         .route("/v1/alarms/history", get(alarms::past))
         .route(

@@ -14,6 +14,7 @@ mod lab;
 mod library;
 mod metrics;
 mod page;
+mod programs;
 mod rollouts;
 mod sharing;
 

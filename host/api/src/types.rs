@@ -19,6 +19,7 @@ mod load;
 mod loops;
 mod news;
 mod past;
+mod programs;
 mod record;
 mod rollouts;
 mod words;
@@ -50,6 +51,10 @@ pub use loops::{
 };
 pub use news::{FieldNews, PointForced, PointUnforced, PointWritten, StandbyTold};
 pub use past::{History, HistoryPart, HistoryStretch, HistoryValues};
+pub use programs::{
+    Program, ProgramGrant, ProgramLine, ProgramLog, ProgramOrderRequest, ProgramRequest, ProgramStatus, ProgramWord,
+    Programs,
+};
 pub use record::{Alarm, Applied, Aside, Event, LogLine, Message, Reading, Record, Redundancy, Vote};
 pub use rollouts::{OnFailure, Rollout, RolloutLoop, RolloutRequest, RolloutStage, RolloutState, Rollouts, SilentHost};
 pub use words::{Direction, LogLevel, Mode, OnBump, OnFault, OnFewer, PortKind, Priority, Quality, Strategy};

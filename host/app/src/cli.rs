@@ -15,6 +15,7 @@ pub(crate) mod io;
 mod lab;
 mod library;
 mod past;
+mod program;
 mod rollout;
 
 pub(crate) use alarm::{AlarmCommand, Of as AlarmOf};
@@ -24,6 +25,7 @@ pub(crate) use history::HistoryCommand;
 pub(crate) use lab::{LabArgs, LabCommand, LabRunArgs};
 pub(crate) use library::{ComponentsArgs, ComponentsCommand, FilterArgs, UploadArgs};
 pub(crate) use past::{FormatWord, HistoryArgs};
+pub(crate) use program::ProgramCommand;
 pub(crate) use rollout::{RolloutArgs, RolloutCommand};
 
 use crate::{client::Client, commands, demo, error::Error, host, watch};
@@ -70,7 +72,7 @@ pub(crate) enum Command {
     Host(HostArgs),
     /// Start a whole cell on this machine: a simulated plant, three controller hosts, one running loop.
     Demo(DemoArgs),
-    /// Upload a component (a .wasm file) to the cell's library.
+    /// Upload a component (a .wasm file) or a script (.lua) to the cell's library.
     Upload(UploadArgs),
     /// The library: list, show, label, download, export, import, delete.
     Components(ComponentsArgs),
@@ -78,6 +80,11 @@ pub(crate) enum Command {
     Loop {
         #[command(subcommand)]
         what: LoopCommand,
+    },
+    /// Free-running programs and scripts: apply, start, stop, pause, resume, list, show, log, checkpoint.
+    Program {
+        #[command(subcommand)]
+        what: ProgramCommand,
     },
     /// One component for many loops: one loop first, then the rest by rule.
     Rollout {
@@ -357,6 +364,7 @@ pub fn run(cli: Cli) -> Result<(), Error> {
             commands::components::run(&client()?, json, what.unwrap_or(ComponentsCommand::List(filter)))
         }
         Command::Loop { what } => commands::loops::run(&client()?, json, what),
+        Command::Program { what } => commands::programs::run(&client()?, json, what),
         Command::Rollout { what } => commands::rollouts::run(&client()?, json, what),
         Command::Alarm { what } => commands::alarms::run(&client()?, json, what.unwrap_or(AlarmCommand::standing())),
         Command::Audit { what } => commands::audit::run(
@@ -426,6 +434,17 @@ mod tests {
             "bumpless rollout start pid@1.1.0 pressure level --cycles 100 --factor 1.5 --at-once 2 --on-failure back --wait",
             "bumpless rollout start pid --all-of pid@1.0.0 -p k=2 -p action=direct --json",
             "bumpless rollout list",
+            "bumpless program apply level.toml",
+            "bumpless program start level --json",
+            "bumpless program pause level",
+            "bumpless program resume level",
+            "bumpless program stop level",
+            "bumpless program list",
+            "bumpless program show level",
+            "bumpless program log level --lines 5",
+            "bumpless program checkpoint level -o x",
+            "bumpless program delete level",
+            "bumpless components script level -o level.lua",
             "bumpless rollout show plant.3",
             "bumpless rollout stop plant.3",
             "bumpless alarm",

@@ -15,4 +15,5 @@ pub(crate) mod library;
 pub(crate) mod loops;
 pub(crate) mod past;
 pub(crate) mod point_lists;
+pub(crate) mod programs;
 pub(crate) mod rollouts;

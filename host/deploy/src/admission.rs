@@ -14,6 +14,18 @@ mod trial;
 
 pub(crate) use plant::plant_descriptor;
 
+/// What a program says of itself as the library keeps it.
+pub(crate) fn program_descriptor(info: &bumpless_engine::ProgramInfo) -> bumpless_core::Descriptor {
+    bumpless_core::Descriptor {
+        name: info.name.clone(),
+        version: info.version.clone(),
+        text: info.text.clone(),
+        ports: Vec::new(),
+        parameters: Vec::new(),
+        state_layout: 0,
+    }
+}
+
 use std::{sync::Arc, time::Duration};
 
 use bumpless_core::{

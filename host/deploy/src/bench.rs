@@ -207,8 +207,11 @@ impl Room {
     /// How far this host is with a component.
     pub(crate) fn stage_here(&self, digest: &Digest) -> Stage {
         self.bench.stage(digest).unwrap_or_else(|| {
-            // A plant is compiled by the bus that runs it.
-            let is_plant = || self.library.get(digest).is_some_and(|info| info.is_plant());
+            // A plant is compiled by the bus that runs it, a program by its owner.
+            let is_plant = || {
+                let info = self.library.get(digest);
+                info.is_some_and(|info| info.is_plant() || info.is_program())
+            };
             if self.store.has_component(digest) {
                 if is_plant() { Stage::Ready } else { Stage::Bytes }
             } else {
@@ -263,7 +266,7 @@ impl Room {
             tick.tick().await;
             let mut infos = room.library.all();
             // Plants are run by buses, each on its own host, from its start.
-            infos.retain(|info| !info.is_plant());
+            infos.retain(|info| !info.is_plant() && !info.is_program());
             infos.sort_by_key(|info| std::cmp::Reverse(info.uploaded_at_unix_ms));
             room.forget_unneeded(&infos);
             let now = Instant::now();

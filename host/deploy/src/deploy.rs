@@ -24,6 +24,7 @@ mod changes;
 mod field;
 mod past;
 mod points;
+mod programs;
 mod rollouts;
 
 /// One host's part in the cell. Clones share it. It lives until [`Deploy::shutdown`].
@@ -210,6 +211,7 @@ impl Deploy {
         }
         self.room.end_audit().await;
         self.room.stop();
+        self.room.programs.runner.close();
         let room = Arc::clone(&self.room);
         let flush = move || match &room.cycles {
             Some(cycles) => room.feed.flush().and(cycles.flush()),

@@ -173,7 +173,9 @@ impl Room {
         let io = self.io.as_ref()?;
         let info = io.info(io.index(point)?)?;
         let taken_by = if info.writable {
-            self.book.writer_of(point, Some(of))
+            self.book
+                .writer_of(point, Some(of))
+                .or_else(|| self.programs.writer_of(point))
         } else {
             None
         };

@@ -19,7 +19,7 @@
 //! `change`, `orders`, `health` (what it does);
 //! `trials` with `rehearsal`, `verdict`, `replay`, `shadows`, `curve`, `report` (looking back, and trying candidates);
 //! `rollout` (one component for many loops, by rule); `history` (what was, for years); `audit` (who changed what);
-//! `webhook`, `self_watch`;
+//! `webhook`, `self_watch`; `programs` (free-running ones);
 //! `sync`, `answers`, `service`, `room`, `deploy` (how it hangs together).
 
 mod admission;
@@ -67,6 +67,7 @@ mod wire;
 pub mod commissioning;
 pub mod draft;
 pub mod limits;
+pub mod programs;
 pub mod report;
 pub mod rollout;
 pub mod view;

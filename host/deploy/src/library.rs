@@ -49,6 +49,12 @@ pub(crate) fn title(info: &ComponentInfo) -> String {
 
 /// A component that a loop can run; or why it cannot.
 pub(crate) fn as_controller(info: Arc<ComponentInfo>) -> Result<Arc<ComponentInfo>, Error> {
+    if info.is_program() {
+        return Err(Error::invalid(
+            format!("{} is a program, and no controller", title(&info)),
+            "start it as a program",
+        ));
+    }
     if info.is_plant() {
         return Err(Error::invalid(
             format!("{} is a plant, and no controller", title(&info)),

@@ -45,6 +45,7 @@ use crate::{
     home::Homes,
     library::Library,
     limits::{CHANGES_MAX, NOTICES_WAITING_MAX, RECONCILE_EVERY, REHEARSALS_MAX, SENDING_MAX, UPLOADS_MAX},
+    programs::Programs,
     rollout::ledger::Ledger,
     roster::Roster,
     self_watch::{HostAlarms, SelfWatch},
@@ -164,6 +165,7 @@ pub(crate) struct Room {
     pub(crate) archive: Option<Arc<Archive>>,
     pub(crate) shadows: Shadows,
     pub(crate) rollouts: Ledger,
+    pub(crate) programs: Programs,
     pub(crate) alarms: Alarms,
     pub(crate) terms: Terms,
     pub(crate) audit: Audit,
@@ -254,6 +256,7 @@ impl Room {
         let terms = Terms::begin(&store, &records);
         let book = Book::open(store.clone())?;
         let library = Library::open(store.clone())?;
+        let programs = Programs::open(&store)?;
         let room = Arc::new(Self {
             book,
             library,
@@ -265,6 +268,7 @@ impl Room {
             archive,
             shadows: Shadows::default(),
             rollouts: Ledger::default(),
+            programs,
             alarms: Alarms::default(),
             audit,
             webhooks,
@@ -320,6 +324,7 @@ impl Room {
         room.spawn(Self::watch_self(Arc::clone(&room)));
         room.spawn(Self::watch_alarms(Arc::clone(&room), room.feed.subscribe()));
         room.resume_rollouts()?;
+        room.spawn(Self::keep_programs(Arc::clone(&room)));
         room.resume_forces()?;
         room.spawn(Self::watch_queues(Arc::clone(&room)));
         room.watch_masters();
@@ -357,6 +362,7 @@ impl Room {
     pub(crate) fn poke(&self) {
         self.poke_homes.notify_one();
         self.poke_holds.notify_one();
+        self.programs.poke.notify_one();
     }
 
     /// Pokes later.
@@ -412,10 +418,12 @@ impl Room {
                 }
                 self.keep_cycle(&record);
                 self.keep_history(&record);
+                self.say_of(&record);
                 self.feed.pass(record);
             }
             DeployArrival::Loops(LoopsEvent::Outcome { record, alone }) => self.feed.keep(record, alone),
             DeployArrival::Bus(Arrival::Record(record)) => {
+                self.say_of(&record);
                 self.keep_history(&record);
                 self.feed.pass(record);
             }
@@ -436,6 +444,7 @@ impl Room {
             DeployArrival::Bus(Arrival::Notice { from, payload }) => match wire::decode::<Notice>("notice", &payload) {
                 Ok(Notice::Field(event)) => self.commissioning.tell(*event),
                 Ok(Notice::Alarm(event)) => self.alarms.heard(*event),
+                Ok(Notice::Message(message)) => self.programs.runner.say(&message),
                 Ok(notice) => {
                     if self.notices.try_send((from, notice)).is_err() {
                         count(&self.tallies.arrivals_dropped);
@@ -470,6 +479,18 @@ impl Room {
             }
             DeployArrival::Bus(other) => tracing::debug!(?other, "an arrival that is not for deployment"),
         }
+    }
+
+    /// What loops say, to the programs that listen here.
+    fn say_of(&self, record: &bumpless_core::Record) {
+        for message in &record.messages {
+            self.programs.runner.say(message);
+        }
+    }
+
+    /// The runtime that deployment works on.
+    pub(crate) fn async_runtime(&self) -> Handle {
+        self.runtime.clone()
     }
 
     /// A record of a failing loop, taken at its home, which is here. Asked again when the faults have doubled.

@@ -75,7 +75,7 @@ impl Room {
             Notice::Intent(id, position) => self.book.wants(id, *position),
             Notice::Gone(tombstone) => self.book.mourns(tombstone),
             // These are passed on where they arrive.
-            Notice::Field(_) | Notice::Alarm(_) => false,
+            Notice::Field(_) | Notice::Alarm(_) | Notice::Message(_) => false,
         }
     }
 
@@ -96,7 +96,7 @@ impl Room {
             Notice::ComponentGone(digest, at_ms) => self.component_gone(digest, at_ms).await,
             Notice::Intent(id, _) => self.copy_intent(from, id).await,
             Notice::Gone(tombstone) => self.loop_gone(tombstone).await,
-            Notice::Field(_) | Notice::Alarm(_) => Ok(()),
+            Notice::Field(_) | Notice::Alarm(_) | Notice::Message(_) => Ok(()),
         }
     }
 

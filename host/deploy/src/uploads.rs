@@ -9,7 +9,7 @@ use std::{collections::BTreeMap, sync::Arc};
 
 use bumpless_core::{
     ComponentInfo, Digest,
-    component::{CONTROLLER_WORLD, PLANT_WORLD, check_labels},
+    component::{CONTROLLER_WORLD, PLANT_WORLD, PROGRAM_WORLD, check_labels},
     limits::TEXT_CHARS_MAX,
 };
 use bumpless_engine::Either;
@@ -18,7 +18,7 @@ use tracing::{Instrument as _, info_span};
 
 use crate::{
     SPANS,
-    admission::{let_in, plant_descriptor},
+    admission::{let_in, plant_descriptor, program_descriptor},
     bench::{engine_error, stopping},
     book::on_disk,
     bundle,
@@ -46,6 +46,10 @@ fn check_words(by: &str, note: &str) -> Result<(), Error> {
 impl Room {
     /// Takes a component in.
     pub(crate) async fn upload(self: &Arc<Self>, bytes: Vec<u8>, upload: &Upload) -> Result<Arc<ComponentInfo>, Error> {
+        let bytes = match &upload.script {
+            Some(name) => self.wrapped(bytes, name).await?,
+            None => bytes,
+        };
         let span =
             info_span!(target: SPANS, "upload", bytes = bytes.len(), by = upload.by, name = tracing::field::Empty);
         let end = self.take_in(bytes.into(), upload).instrument(span).await;
@@ -59,6 +63,10 @@ impl Room {
 
     /// What taking it in would find. Nothing stays.
     pub(crate) async fn try_out(self: &Arc<Self>, bytes: Vec<u8>, upload: &Upload) -> Result<ComponentInfo, Error> {
+        let bytes = match &upload.script {
+            Some(name) => self.wrapped(bytes, name).await?,
+            None => bytes,
+        };
         let (info, _) = self.examined(&bytes.into(), upload).await?;
         self.forget_unkept(&info.digest);
         Ok(info)
@@ -96,6 +104,11 @@ impl Room {
                 (inspection.descriptor.clone(), CONTROLLER_WORLD, imports)
             }
             Either::Plant(plant, _) => (plant_descriptor(plant.info()), PLANT_WORLD, plant.imports().to_vec()),
+            Either::Program(program, _) => (
+                program_descriptor(program.info()),
+                PROGRAM_WORLD,
+                program.imports().to_vec(),
+            ),
         };
         let mut info = ComponentInfo {
             digest,
@@ -122,11 +135,13 @@ impl Room {
         let admission = match opened {
             Either::Controller(inspection, prepared) => {
                 let trial = self.tried(prepared, &info.imports, inspection.compile_time);
-                trial.instrument(span).await?
+                Some(trial.instrument(span).await?)
             }
-            Either::Plant(plant, compile_time) => self.tried_plant(plant, compile_time).instrument(span).await?,
+            Either::Plant(plant, compile_time) => Some(self.tried_plant(plant, compile_time).instrument(span).await?),
+            // It has no step to be tried on: what it does wrong becomes its status.
+            Either::Program(..) => None,
         };
-        info.admission = Some(admission);
+        info.admission = admission;
         info.check().map_err(|error| Error::invalid(error.to_string(), ""))?;
         Ok((info, false))
     }
@@ -173,6 +188,7 @@ impl Room {
         self.announce(&Notice::Component(info.digest, info.edition()));
         // Ready here at once, so that what is uploaded can be called. A full engine is told when it matters.
         if !info.is_plant()
+            && !info.is_program()
             && let Err(error) = self.prepared(info.digest, None).await
         {
             tracing::warn!(digest = %info.digest, %error, "an uploaded component is not ready here yet");
@@ -233,6 +249,12 @@ impl Room {
         let _admission = self.admission.lock().await;
         let info = self.library.resolve(reference)?;
         let users = self.book.users().remove(&info.digest).unwrap_or_default();
+        if let Some(program) = self.programs.users(&info.digest).first() {
+            return Err(Error::refused(
+                format!("component {} is used by program {program}", title(&info)),
+                "remove the program first",
+            ));
+        }
         if !users.is_empty() {
             let names = users
                 .iter()
@@ -295,6 +317,7 @@ impl Room {
                         note: parcel.note,
                         labels: parcel.labels,
                         force,
+                        script: None,
                     };
                     (known, self.upload(parcel.bytes, &upload).await)
                 }
@@ -325,4 +348,47 @@ fn list(labels: &BTreeMap<String, String>) -> String {
     }
     let labels: Vec<String> = labels.iter().map(|(key, value)| format!("{key}={value}")).collect();
     labels.join(", ")
+}
+
+/// The interpreter of scripts, as the library calls it.
+const INTERPRETER: &str = "lua3c";
+
+impl Room {
+    /// A script in its interpreter. One that is in the library, letter by letter, comes back as it is there; another one gets the
+    /// next version of its name.
+    async fn wrapped(self: &Arc<Self>, text: Vec<u8>, name: &str) -> Result<Vec<u8>, Error> {
+        let interpreter = self.library.resolve(INTERPRETER).map_err(|_| {
+            Error::not_found(
+                format!("there is no {INTERPRETER} in the library to run scripts"),
+                format!("upload {INTERPRETER}.wasm first"),
+            )
+        })?;
+        let newest = self.library.resolve(name).ok();
+        let mut version = "1.0.0".to_owned();
+        if let Some(newest) = newest.filter(|info| info.name == name) {
+            let bytes = self.bytes_of(newest.digest, None).await?;
+            if bumpless_engine::split(&bytes)
+                .1
+                .is_some_and(|script| script.text == text)
+            {
+                return Ok(bytes);
+            }
+            version = next_version(&newest.version);
+        }
+        let base = self.bytes_of(interpreter.digest, None).await?;
+        let script = bumpless_engine::Script {
+            name: name.to_owned(),
+            version,
+            text,
+        };
+        bumpless_engine::wrap(&base, &script).map_err(|error| engine_error(&error))
+    }
+}
+
+/// `1.2.3` is followed by `1.2.4`.
+fn next_version(version: &str) -> String {
+    match version.rsplit_once('.') {
+        Some((front, last)) => format!("{front}.{}", last.parse::<u64>().map_or(0, |n| n + 1)),
+        None => "1.0.0".to_owned(),
+    }
 }

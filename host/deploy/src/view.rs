@@ -30,6 +30,8 @@ pub struct Upload {
     pub labels: BTreeMap<String, String>,
     /// Take it in even where its trial refuses it. Its report says who did so.
     pub force: bool,
+    /// The bytes are a script of this name, for the interpreter of the library.
+    pub script: Option<String>,
 }
 
 /// A change of what people wrote about a component.

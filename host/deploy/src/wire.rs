@@ -7,7 +7,8 @@
 use std::collections::BTreeMap;
 
 use bumpless_core::{
-    Command, ComponentInfo, Digest, Edition, HostId, Intent, LoopId, LoopSpec, PointId, Reading, Record, alarms::Flood,
+    Command, ComponentInfo, Digest, Edition, HostId, Intent, LoopId, LoopSpec, Message, PointId, Reading, Record,
+    alarms::Flood,
 };
 use bumpless_store::{Tombstone, Window};
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
@@ -21,6 +22,7 @@ use crate::{
     expect::Expect,
     health::HealthView,
     history::{HistoryAsk, HistoryTold},
+    programs::{ProgramAsk, ProgramTold},
     report::{CyclesView, ReplayReport, ShadowView, Trial, TrialReport},
     rollout::RolloutView,
     view::{ApplyEnd, CommandEnd, DrainEnd, DrainOrder, PointView, Stage},
@@ -28,7 +30,7 @@ use crate::{
 };
 
 /// Version of these lists. Another one is refused in words, so that a half updated cell says what is the matter.
-const VERSION: u8 = 4;
+const VERSION: u8 = 5;
 
 /// A position of an intent among its copies: see [`Intent::position`].
 pub(crate) type Position = (u64, u64);
@@ -106,6 +108,8 @@ pub(crate) enum Ask {
     AlarmLoad,
     /// What the host has of a loop's or a point's history.
     History(Box<HistoryAsk>),
+    /// About programs at home or running there.
+    Program(Box<ProgramAsk>),
 }
 
 /// What may be asked about alarms.
@@ -248,6 +252,8 @@ pub(crate) enum Told {
     Field(Box<FieldTold>),
     /// History.
     History(Box<HistoryTold>),
+    /// What was asked about programs.
+    Program(Box<ProgramTold>),
     /// A component's bytes. Never written by serde: see [`encode_reply`].
     #[serde(skip)]
     Bytes(Vec<u8>),
@@ -275,6 +281,8 @@ pub(crate) enum Notice {
     Field(Box<FieldEvent>),
     /// Something happened to an alarm of a loop at home there.
     Alarm(Box<AlarmEvent>),
+    /// A program said something.
+    Message(Message),
 }
 
 /// A value with its version.

@@ -36,6 +36,7 @@ mod error;
 mod forces;
 mod format;
 mod intents;
+mod programs;
 mod records;
 mod rollouts;
 mod settings;

@@ -137,6 +137,8 @@ pub(crate) struct UploadQuery {
     /// Only report what an upload would find. Nothing stays.
     #[serde(default)]
     dry_run: bool,
+    /// The bytes are a script, which gets this name; the newest `lua3c` of the library runs it.
+    script: Option<String>,
 }
 
 /// `stage=pilot,line=3` as labels.
@@ -181,7 +183,10 @@ pub(crate) async fn upload(
     headers: HeaderMap,
     body: Body,
 ) -> Result<Response, Problem> {
-    content_type(&headers, &["application/wasm", "application/octet-stream"])?;
+    content_type(
+        &headers,
+        &["application/wasm", "application/octet-stream", "text/x-lua"],
+    )?;
     let note = words(query.note, &headers, "x-note")?;
     let by = words(query.by, &headers, "x-by")?;
     let by = if by.is_empty() { "api".to_owned() } else { by };
@@ -208,6 +213,7 @@ pub(crate) async fn upload(
         note,
         labels,
         force: query.force,
+        script: query.script,
     };
     if query.dry_run {
         let info = finish(app.cell.try_out(bytes, upload)).await?;

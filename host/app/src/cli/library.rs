@@ -11,7 +11,7 @@ use super::pair;
 /// An upload.
 #[derive(Debug, Args)]
 pub(crate) struct UploadArgs {
-    /// The component.
+    /// The component, or a script: a file that ends in .lua, which is named after it.
     pub(crate) file: PathBuf,
     /// A line about it, for people.
     #[arg(long, default_value = "")]
@@ -84,6 +84,14 @@ pub(crate) enum ComponentsCommand {
         /// `name`, `name@version`, or a digest or its first 8 digits.
         component: String,
         /// Where to; `name-version.wasm` where not given.
+        #[arg(long, short, value_name = "FILE")]
+        output: Option<PathBuf>,
+    },
+    /// Write the script of one to a file, byte by byte as it was uploaded.
+    Script {
+        /// `name`, `name@version`, or a digest or its first 8 digits.
+        component: String,
+        /// Where to; standard output where not given.
         #[arg(long, short, value_name = "FILE")]
         output: Option<PathBuf>,
     },

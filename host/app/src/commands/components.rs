@@ -26,13 +26,17 @@ pub(crate) fn upload(client: &Client, json: bool, args: &UploadArgs) -> Result<(
         .iter()
         .map(|(key, value)| format!("{key}={value}"))
         .collect();
-    let query = format!(
+    let mut query = format!(
         "note={}&labels={}&force={}&dry_run={}",
         encoded(&args.note),
         encoded(&labels.join(",")),
         args.force,
         args.dry_run
     );
+    if args.file.extension().is_some_and(|extension| extension == "lua") {
+        let stem = args.file.file_stem().unwrap_or_default().to_string_lossy();
+        query.push_str(&format!("&script={}", encoded(&stem)));
+    }
     let (component, text) = send(client, &args.file, &query, std::io::stderr().is_terminal() && !json)?;
     if json {
         show::json(&text)?;
@@ -104,6 +108,7 @@ pub(crate) fn run(client: &Client, json: bool, what: ComponentsCommand) -> Resul
         ComponentsCommand::Import { file, force } => library::import(client, json, &file, force),
         ComponentsCommand::Show { component } => show_one(client, json, &component),
         ComponentsCommand::Download { component, output } => download(client, &component, output),
+        ComponentsCommand::Script { component, output } => script(client, &component, output.as_deref()),
         ComponentsCommand::Delete { component } => {
             client.delete(&path(&component))?;
             show::line(&format!("{component} deleted"))
@@ -254,6 +259,20 @@ fn download(client: &Client, component: &str, output: Option<PathBuf>) -> Result
     let output = output.unwrap_or_else(|| PathBuf::from(format!("{}-{}.wasm", found.name, found.version)));
     fs::write(&output, &bytes).map_err(|source| Error::File {
         path: output.clone(),
+        action: "written",
+        source,
+    })?;
+    show::line(&format!("{} ({})", output.display(), show::size(bytes.len() as u64)))
+}
+
+/// The script of a component.
+fn script(client: &Client, component: &str, output: Option<&Path>) -> Result<(), Error> {
+    let bytes = client.bytes(&format!("{}/script", path(component)), COMPONENT_BYTES_MAX as u64)?;
+    let Some(output) = output else {
+        return show::line(String::from_utf8_lossy(&bytes).trim_end_matches('\n'));
+    };
+    fs::write(output, &bytes).map_err(|source| Error::File {
+        path: output.to_owned(),
         action: "written",
         source,
     })?;

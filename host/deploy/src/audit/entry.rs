@@ -107,6 +107,18 @@ kinds! {
     AlarmDefine = "alarm.define",
     /// An alarm was removed.
     AlarmRemove = "alarm.remove",
+    /// A program was created or changed.
+    ProgramCreate = "program.create",
+    /// A program was started.
+    ProgramStart = "program.start",
+    /// A program was stopped.
+    ProgramStop = "program.stop",
+    /// A program was paused.
+    ProgramPause = "program.pause",
+    /// A program goes on.
+    ProgramResume = "program.resume",
+    /// A program was removed.
+    ProgramRemove = "program.remove",
     /// A host was emptied.
     HostDrain = "host.drain",
     /// A host takes loops again.

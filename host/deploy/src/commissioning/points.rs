@@ -69,7 +69,11 @@ impl Room {
         if !io.speaks_for(index) {
             return Err(self.not_master(point));
         }
-        if let Some(writer) = self.book.writer_of(point, None) {
+        if let Some(writer) = self
+            .book
+            .writer_of(point, None)
+            .or_else(|| self.programs.writer_of(point))
+        {
             return Err(Error::refused(
                 format!("loop {writer} writes {point}"),
                 "put the loop in manual and set its output, or force the point",
@@ -141,7 +145,7 @@ impl Room {
     }
 
     /// The host that serves a point: this one, or the one that says so.
-    async fn host_of(self: &Arc<Self>, point: &PointId) -> Result<HostId, Error> {
+    pub(crate) async fn host_of(self: &Arc<Self>, point: &PointId) -> Result<HostId, Error> {
         if self.speaks_for(point) {
             return Ok(self.here.clone());
         }

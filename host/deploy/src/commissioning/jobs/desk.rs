@@ -166,7 +166,11 @@ impl Room {
             .touched(&bus, &errand)
             .map_err(|error| Error::not_found(chain(&error), ""))?;
         for point in touched {
-            if let Some(writer) = self.book.writer_of(&point, None) {
+            if let Some(writer) = self
+                .book
+                .writer_of(&point, None)
+                .or_else(|| self.programs.writer_of(&point))
+            {
                 return Err(Error::refused(
                     format!("{} is point {point}, which loop {writer} writes", errand.place()),
                     "delete the loop, or leave these addresses to it",
