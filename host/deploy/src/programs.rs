@@ -12,7 +12,10 @@ mod arm;
 mod home;
 mod owner;
 
-use std::{collections::BTreeMap, sync::Arc};
+use std::{
+    collections::BTreeMap,
+    sync::{Arc, atomic::AtomicU64},
+};
 
 use bumpless_core::{
     Fence, HostId, LogLevel, LoopId, PointId, ProgramId, ProgramSpec, Reading,
@@ -250,23 +253,28 @@ pub(crate) struct Kept {
 pub(crate) struct Programs {
     pub(crate) runner: Runner,
     pub(crate) desks: Mutex<BTreeMap<ProgramId, Kept>>,
+    /// The greatest term that was given, of any program: one that is removed and comes again must not meet its own past.
+    pub(crate) last_term: AtomicU64,
     /// Held while a desk is changed, so that what is older never overwrites what is newer on the disk.
     pub(crate) changing: tokio::sync::Mutex<()>,
     pub(crate) poke: Notify,
 }
 
 impl Programs {
-    /// Reads what is at home here. Blocks.
+    /// Reads what is at home here, and begins a term of each: writes are counted from anew in this life. Blocks.
     pub(crate) fn open(store: &Store) -> Result<Self, Error> {
         let runner = Runner::start().map_err(|error| Error::Internal(Words::new(chain(&error), "")))?;
-        let desks = store
-            .programs::<Desk>()?
-            .into_iter()
-            .map(|(_, desk)| (desk.spec.id.clone(), Kept::new(desk)))
-            .collect();
+        let (mut desks, mut last_term) = (BTreeMap::new(), 0);
+        for (_, mut desk) in store.programs::<Desk>()? {
+            desk.fence = desk.fence.given_to(desk.fence.owner.clone());
+            store.put_program(desk.spec.id.as_str(), &desk)?;
+            last_term = last_term.max(desk.fence.term);
+            desks.insert(desk.spec.id.clone(), Kept::new(desk));
+        }
         Ok(Self {
             runner,
             desks: Mutex::new(desks),
+            last_term: AtomicU64::new(last_term),
             changing: tokio::sync::Mutex::default(),
             poke: Notify::new(),
         })

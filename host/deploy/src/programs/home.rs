@@ -8,7 +8,10 @@
 //! ```
 //! Owns: the desks, on disk before anything is told. Never: waits for a host that is silent longer than for an answer.
 
-use std::{collections::BTreeMap, sync::Arc};
+use std::{
+    collections::BTreeMap,
+    sync::{Arc, atomic::Ordering},
+};
 
 use bumpless_core::{
     Fence, Grant, HostId, LoopId, PointId, ProgramId, ProgramSpec,
@@ -125,6 +128,7 @@ impl Room {
 
     /// Puts a changed desk on the disk, then in memory. The caller holds `changing`.
     async fn program_keep(&self, desk: Desk) -> Result<(), Error> {
+        self.programs.last_term.fetch_max(desk.fence.term, Ordering::AcqRel);
         let (store, copy) = (self.store.clone(), desk.clone());
         on_disk(move || store.put_program(copy.spec.id.as_str(), &copy)).await??;
         let mut desks = self.programs.desks.lock();
@@ -150,7 +154,7 @@ impl Room {
         let fence = before.as_ref().map_or_else(
             || Fence {
                 owner: self.here.clone(),
-                term: self.terms.floor(),
+                term: self.terms.floor().max(self.programs.last_term.load(Ordering::Acquire)),
             },
             |desk| desk.fence.clone(),
         );
