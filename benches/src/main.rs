@@ -24,6 +24,7 @@ mod local;
 mod masters;
 mod page;
 mod peer;
+mod programs;
 mod redundancy;
 mod report;
 mod rest;
@@ -86,6 +87,8 @@ enum Bench {
     Lab,
     /// The long memory: cycles in, bytes on disk, a day on a thousand columns.
     History,
+    /// The published experiments of 3C scripts: square wave, PID cycle, jitter; and 5,000 programs that sleep.
+    Programs,
     /// A step native and in the sandbox, and the cycle of a loop whose owner, replica and I/O are one process.
     Step,
     /// 1,000 points on ten Modbus devices at 10 Hz: requests, staleness, processor time; and one device that is slow.
@@ -163,6 +166,7 @@ fn run(bench: &Bench, options: Options) -> Result<bool, Error> {
         Bench::Swap(_) => "swap",
         Bench::History => "history",
         Bench::Lab => "lab",
+        Bench::Programs => "programs",
         Bench::Step => "step",
         Bench::Upload => "upload",
         Bench::Page(_) => "page",
@@ -185,6 +189,7 @@ fn run(bench: &Bench, options: Options) -> Result<bool, Error> {
         Bench::Swap(_) => swap::run(options, &mut report)?,
         Bench::History => archive::run(options, &mut report)?,
         Bench::Lab => lab::run(options, &mut report)?,
+        Bench::Programs => programs::run(options, &mut report)?,
         Bench::Step => step::run(options, &mut report)?,
         Bench::Upload => upload::run(options, &mut report)?,
         Bench::Page(watching) => page::run(options, *watching, &mut report)?,

@@ -59,6 +59,16 @@ impl Program for FreeRuns {
                 );
                 Ok(())
             }
+            // Turns a pin over once in so many ms, without drift.
+            "beat" => {
+                let (out, period_ns) = (point("dout-17")?, number(&mut words).unwrap_or(50) * 1_000_000);
+                let mut next_ns = clock::now_ns();
+                loop {
+                    next_ns += period_ns;
+                    clock::sleep_until_ns(next_ns);
+                    points::write(out, (next_ns / period_ns % 2) as f64).map_err(Fault::Failed)?;
+                }
+            }
             "copy" => {
                 let (from, to) = (point("in")?, point("out")?);
                 loop {
