@@ -26,6 +26,7 @@ async fn labels_and_notes_reach_every_host_and_the_newer_ones_win() {
         note: "first".into(),
         labels: BTreeMap::from([("stage".to_owned(), "test".to_owned())]),
         force: false,
+        script: None,
     };
     io.deploy.take_in(component("pid"), &upload).await.unwrap();
     let seen_by_a = |wanted: &'static str| {
@@ -172,6 +173,7 @@ async fn a_bundle_goes_from_one_cell_to_another() {
         note: "for the plant".into(),
         labels: BTreeMap::from([("stage".to_owned(), "pilot".to_owned())]),
         force: false,
+        script: None,
     };
     here.deploy.take_in(component("pid"), &upload).await.unwrap();
     here.deploy.upload(component("on-off"), "ann", "").await.unwrap();
