@@ -28,6 +28,7 @@ mod programs;
 mod redundancy;
 mod report;
 mod rest;
+mod scripts;
 mod select;
 mod spread;
 mod stall;
@@ -89,6 +90,12 @@ enum Bench {
     History,
     /// The published experiments of 3C scripts: square wave, PID cycle, jitter; and 5,000 programs that sleep.
     Programs,
+    /// The published level control by 3C scripts, on one board and on two, as pictures.
+    Scripts {
+        /// Where the pictures go.
+        #[arg(long, default_value = "docs/figures")]
+        folder: std::path::PathBuf,
+    },
     /// A step native and in the sandbox, and the cycle of a loop whose owner, replica and I/O are one process.
     Step,
     /// 1,000 points on ten Modbus devices at 10 Hz: requests, staleness, processor time; and one device that is slow.
@@ -167,6 +174,7 @@ fn run(bench: &Bench, options: Options) -> Result<bool, Error> {
         Bench::History => "history",
         Bench::Lab => "lab",
         Bench::Programs => "programs",
+        Bench::Scripts { .. } => "scripts",
         Bench::Step => "step",
         Bench::Upload => "upload",
         Bench::Page(_) => "page",
@@ -190,6 +198,7 @@ fn run(bench: &Bench, options: Options) -> Result<bool, Error> {
         Bench::History => archive::run(options, &mut report)?,
         Bench::Lab => lab::run(options, &mut report)?,
         Bench::Programs => programs::run(options, &mut report)?,
+        Bench::Scripts { folder } => scripts::run(folder, &mut report)?,
         Bench::Step => step::run(options, &mut report)?,
         Bench::Upload => upload::run(options, &mut report)?,
         Bench::Page(watching) => page::run(options, *watching, &mut report)?,

@@ -211,7 +211,7 @@ impl Stand {
                 .ok_or_else(|| Error::Wish("the run is gone".to_owned()))?;
             match view.status {
                 Status::Stopped => {
-                    self.runner.forget(&id);
+                    self.runner.forget(&id, 1);
                     return Ok(view.used_ns as f64 / 1e9);
                 }
                 Status::Fault => return Err(Error::Wish(format!("a program is in fault: {}", view.reason))),
@@ -348,7 +348,7 @@ fn jitter(options: Options, report: &mut Report, stand: &Stand) -> Result<(), Er
         let id = stand.start(name, stand.prepared(&stand.lua, &text)?, &board)?;
         std::thread::sleep(Duration::from_secs(seconds));
         let view = stand.runner.view(&id);
-        stand.runner.forget(&id);
+        stand.runner.forget(&id, 1);
         if let Some(view) = view.filter(|view| view.status == Status::Fault) {
             return Err(Error::Wish(format!("a program is in fault: {}", view.reason)));
         }
@@ -456,7 +456,7 @@ fn sleepers(options: Options, report: &mut Report, stand: &Stand) -> Result<(), 
                 late.join(&own.lock());
             }
         }
-        ids.iter().for_each(|id| stand.runner.forget(id));
+        ids.iter().for_each(|id| stand.runner.forget(id, 1));
         let figure = |what: &str| format!("programs.sleepers.{name}.{what}");
         report.told(&figure("count"), count as f64, "");
         report.figure(&figure("not_running"), faults as f64, "", Bound::AtMost(0.0));

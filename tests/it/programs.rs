@@ -1,5 +1,5 @@
-//! Free-running programs on real hosts: paused while they spin, kill -9 of their owner, and the published 3C scripts on a
-//! simulated process, central and distributed.
+//! Free-running programs on real hosts: paused while they spin, kill -9 of their owner and of their home, and the published 3C
+//! scripts on a simulated process, central and distributed.
 
 use std::{fs, time::Duration};
 
@@ -109,6 +109,84 @@ fn a_program_is_paused_stopped_and_goes_on_from_its_checkpoint_where_its_owner_i
     .unwrap();
     api.delete("/v1/programs/counts").unwrap();
     one_writer(&cell.journal().unwrap());
+}
+
+#[test]
+fn a_program_without_points_goes_on_where_its_home_is_killed_and_its_old_home_lets_it_be() {
+    let mut cell = Cell::start(options().controllers(2)).unwrap();
+    let api = cell.api().unwrap();
+    upload(&api, "programs/lua3c.wasm", "");
+    let counts = b"local n = tonumber(bl.restore() or '0')
+        while true do n = n + 1 bl.save(tostring(n)) o3c.dms(20) end";
+    script(&api, "counts", counts);
+    script(&api, "ends", b"print('done')");
+    // It is at home where it is asked for, and runs there too.
+    let at_a = cell.api_of("a").unwrap();
+    for name in ["counts", "ends"] {
+        // Its library may be a moment behind.
+        let created = wait_until("host a has the script", Duration::from_secs(60), || {
+            let draft = json!({"name": name, "component": name, "prefer": ["a"]});
+            at_a.post("/v1/programs", &draft).map_err(|error| error.to_string())
+        })
+        .unwrap();
+        assert_eq!((text(&created["home"]), text(&created["owner"])), ("a".to_owned(), "a".to_owned()));
+    }
+    let before = until(&api, "counts", "a standby and a checkpoint", |now| {
+        now["standbys"].as_array().is_some_and(|hosts| !hosts.is_empty()) && now["checkpoint_bytes"].as_u64() >= Some(2)
+    });
+    until(&api, "ends", "its end", |now| {
+        text(&now["status"]) == "stopped" && !now["standbys"].as_array().unwrap().is_empty()
+    });
+    // A name is one program's, wherever it is asked for.
+    let refused = api.ask("DELETE", "/v1/components/counts", None).unwrap_err().to_string();
+    assert!(refused.contains("is used by program counts"), "{refused}");
+    let mut counted = 0;
+    wait_until("the standby has counted too", Duration::from_secs(60), || {
+        counted = saved(&api);
+        if counted > 50 { Ok(()) } else { Err(counted) }
+    })
+    .unwrap();
+    cell.host("a").unwrap().kill9();
+    let moved = until(&api, "counts", "another home", |now| {
+        text(&now["home"]) != "a" && text(&now["owner"]) != "a" && text(&now["status"]) == "running"
+    });
+    assert!(whole(&moved["term"]) > whole(&before["term"]), "{moved}");
+    // At most what was counted within the pause between two copies, and within a look, is done again.
+    wait_until("it counts on", Duration::from_secs(60), || {
+        let now = saved(&api);
+        if now > counted { Ok(()) } else { Err(now) }
+    })
+    .unwrap();
+    // What had ended has ended.
+    let ended = until(&api, "ends", "another home", |now| text(&now["home"]) != "a");
+    assert_eq!(text(&ended["status"]), "stopped", "{ended}");
+
+    cell.restart("a").unwrap();
+    let term = whole(&moved["term"]);
+    wait_until("the old home has only a copy, or none", Duration::from_secs(60), || {
+        let list = at_a.get("/v1/programs").map_err(|error| error.to_string())?;
+        let homes: Vec<(String, u64)> = list["programs"]
+            .as_array()
+            .unwrap()
+            .iter()
+            .filter(|program| text(&program["name"]) == "counts")
+            .map(|program| (text(&program["home"]), whole(&program["term"])))
+            .collect();
+        let settled = homes.len() == 1 && homes.iter().all(|(home, now)| home != "a" && *now >= term);
+        if settled { Ok(()) } else { Err(format!("{homes:?}")) }
+    })
+    .unwrap();
+    at_a.delete("/v1/programs/counts").unwrap();
+    at_a.delete("/v1/programs/ends").unwrap();
+    wait_until("all hosts have let go of them", Duration::from_secs(60), || {
+        let left = api.get("/v1/programs").unwrap();
+        if !left["programs"].as_array().unwrap().is_empty() {
+            return Err(left.to_string());
+        }
+        let used = api.ask("DELETE", "/v1/components/counts", None);
+        used.map(drop).map_err(|error| error.to_string())
+    })
+    .unwrap();
 }
 
 fn saved(api: &Api) -> u64 {

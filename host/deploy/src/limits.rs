@@ -321,3 +321,18 @@ pub const AUDIT_REPLY_BYTES: usize = 2 * 1024 * 1024;
 
 /// How long a host may take to verify its chain: 256 MiB at 20 MB/s.
 pub const AUDIT_VERIFY_WAIT: Duration = Duration::from_secs(25);
+
+/// Pause between two rounds of copies of programs: one that saves all the time is copied ten times a second.
+pub const COPIES_PAUSE: Duration = Duration::from_millis(100);
+
+/// How long a host that starts waits for the standbys of its programs before it runs them: one of them may be the home now.
+pub const PROGRAM_SURE_AFTER: Duration = Duration::from_secs(5);
+
+/// How long the home of a program must be away before a standby goes on with it: a host that is started again is back by then.
+pub const PROGRAM_HOME_AWAY: Duration = Duration::from_secs(5);
+
+/// Terms passed over when a program gets another home: what the home before gave out and could not tell.
+pub const PROGRAM_TERMS_SKIPPED: u64 = 1_000_000;
+
+/// Revisions passed over then.
+pub const PROGRAM_REVISIONS_SKIPPED: u64 = 100;

@@ -32,12 +32,17 @@ pub(crate) enum Mastery {
 impl Room {
     /// What this host is to a loop now.
     pub(crate) fn mastery(&self, spec: &LoopSpec) -> Mastery {
+        self.mastery_over(spec.ports.values())
+    }
+
+    /// What this host is to these points now.
+    pub(crate) fn mastery_over<'a>(&self, points: impl Iterator<Item = &'a PointId>) -> Mastery {
         let Some(io) = &self.io else { return Mastery::Alone };
         if io.masterships().is_empty() {
             return Mastery::Alone;
         }
         let (mut epoch, mut missing) = (None, false);
-        for point in spec.ports.values() {
+        for point in points {
             match io.index(point) {
                 None => missing = true,
                 Some(index) => match io.redundant(index).map(|(_, view)| view.epoch) {

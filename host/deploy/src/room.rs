@@ -325,6 +325,7 @@ impl Room {
         room.spawn(Self::watch_alarms(Arc::clone(&room), room.feed.subscribe()));
         room.resume_rollouts()?;
         room.spawn(Self::keep_programs(Arc::clone(&room)));
+        room.spawn(Self::keep_copies(Arc::clone(&room)));
         room.resume_forces()?;
         room.spawn(Self::watch_queues(Arc::clone(&room)));
         room.watch_masters();

@@ -8,11 +8,12 @@
 use std::{collections::BTreeMap, sync::Arc};
 
 use bumpless_core::{
-    ComponentInfo, Digest,
+    ComponentInfo, Digest, ProgramId,
     component::{CONTROLLER_WORLD, PLANT_WORLD, PROGRAM_WORLD, check_labels},
     limits::TEXT_CHARS_MAX,
 };
 use bumpless_engine::Either;
+use futures_util::future::join_all;
 use tokio::time::timeout;
 use tracing::{Instrument as _, info_span};
 
@@ -24,10 +25,11 @@ use crate::{
     bundle,
     error::Error,
     library::title,
-    limits::{BUNDLE_BYTES_MAX, BUNDLE_COMPONENTS_MAX, UPLOAD_WAIT},
+    limits::{BUNDLE_BYTES_MAX, BUNDLE_COMPONENTS_MAX, STAGE_WAIT, UPLOAD_WAIT},
+    programs::{ProgramAsk, ProgramTold},
     room::{Room, count},
     view::{Imported, Relabel, Upload},
-    wire::Notice,
+    wire::{Ask, Notice, Told},
 };
 
 /// May these words be kept?
@@ -249,7 +251,7 @@ impl Room {
         let _admission = self.admission.lock().await;
         let info = self.library.resolve(reference)?;
         let users = self.book.users().remove(&info.digest).unwrap_or_default();
-        if let Some(program) = self.programs.users(&info.digest).first() {
+        if let Some(program) = self.program_with(&info.digest).await {
             return Err(Error::refused(
                 format!("component {} is used by program {program}", title(&info)),
                 "remove the program first",
@@ -348,6 +350,26 @@ fn list(labels: &BTreeMap<String, String>) -> String {
     }
     let labels: Vec<String> = labels.iter().map(|(key, value)| format!("{key}={value}")).collect();
     labels.join(", ")
+}
+
+impl Room {
+    /// A program of the cell that needs a component, as far as the hosts that are there say.
+    async fn program_with(self: &Arc<Self>, digest: &Digest) -> Option<ProgramId> {
+        let mut hosts = self.roster.others();
+        hosts.push(self.here.clone());
+        let asked = hosts.iter().map(|host| {
+            let ask = Ask::Program(Box::new(ProgramAsk::Uses(*digest)));
+            self.ask(host, ask, STAGE_WAIT)
+        });
+        let names = join_all(asked).await.into_iter().filter_map(|answer| match answer {
+            Ok(Told::Program(told)) => match *told {
+                ProgramTold::Names(names) => names.into_iter().next(),
+                _ => None,
+            },
+            _ => None,
+        });
+        names.min()
+    }
 }
 
 /// The interpreter of scripts, as the library calls it.

@@ -8,7 +8,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use bumpless_core::{Digest, Fault, LogLevel, Message, ProgramId, ProgramSpec, program::Status};
+use bumpless_core::{Digest, Fault, HostId, LogLevel, Message, ProgramId, ProgramSpec, program::Status};
 use bumpless_engine::{Answer, Later, ProgramSlot, Question, Reply, Sight, Surroundings, Turn, Usage};
 use parking_lot::Mutex;
 
@@ -60,6 +60,8 @@ pub struct RunView {
     pub id: ProgramId,
     /// Its component.
     pub digest: Digest,
+    /// The host for which it runs.
+    pub home: HostId,
     /// Number of the ownership under which it was started.
     pub term: u64,
     /// What it does.
@@ -171,6 +173,7 @@ impl Run {
         RunView {
             id: self.spec.id.clone(),
             digest: self.spec.digest,
+            home: self.spec.home.clone(),
             term: self.term,
             status,
             reason,
@@ -240,6 +243,10 @@ impl Surroundings for Run {
         let Some(grant) = self.spec.grants.values().nth(slot) else {
             return Answer::Now(Err("the point is not granted".to_owned()));
         };
+        // The guest may run for another ms.
+        if self.gate.has_ended() {
+            return Answer::Now(Err("the run has been ended".to_owned()));
+        }
         match self.reach.write(slot, grant.to_point(value)) {
             Answer::Now(end) => Answer::Now(end),
             Answer::Later(later) => Answer::Later(Box::pin(async move {
@@ -264,6 +271,9 @@ impl Surroundings for Run {
                 "the program is not granted to publish on {:?}",
                 message.topic
             )));
+        }
+        if self.gate.has_ended() {
+            return Answer::Now(Err("the run has been ended".to_owned()));
         }
         match self.publish_at_ns() {
             0 => Answer::Now(self.reach.publish(message)),

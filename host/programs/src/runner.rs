@@ -81,10 +81,10 @@ impl Runner {
         self.exchange.say(message);
     }
 
-    /// Runs a program. One of the name that has ended, or that runs under an earlier term, gives way.
+    /// Runs a program. One of the name under an earlier term gives way.
     ///
     /// # Errors
-    /// [`Error::Runs`] where it runs under this term or a later one.
+    /// [`Error::Runs`] where it runs, or ran, under this term or a later one: a run that has ended is not begun again.
     pub fn run(&self, order: Order) -> Result<(), Error> {
         let Order {
             spec,
@@ -103,7 +103,7 @@ impl Runner {
         {
             let mut runs = self.runs.lock();
             if let Some(before) = runs.get(&id) {
-                if !before.is_over() && before.term >= term {
+                if before.term >= term {
                     return Err(Error::Runs(id, before.term));
                 }
                 before.gate.end();
@@ -132,33 +132,32 @@ impl Runner {
         Ok(())
     }
 
-    /// Lets a program stand where it is, or go on.
+    /// Lets what runs under a term stand where it is, or go on.
     ///
     /// # Errors
     /// [`Error::NotHere`].
-    pub fn pause(&self, id: &ProgramId, paused: bool) -> Result<(), Error> {
-        self.get(id)?.gate.pause(paused);
+    pub fn pause(&self, id: &ProgramId, term: u64, paused: bool) -> Result<(), Error> {
+        let run = self.runs.lock().get(id).filter(|run| run.term == term).cloned();
+        run.ok_or_else(|| Error::NotHere(id.clone()))?.gate.pause(paused);
         Ok(())
     }
 
-    /// Ends a run. It is over at its next wait, or within a few ms of running.
-    ///
-    /// # Errors
-    /// [`Error::NotHere`].
-    pub fn stop(&self, id: &ProgramId) -> Result<(), Error> {
-        let run = self.get(id)?;
-        run.gate.end();
-        // Said at once: what is still on its way has no term to write under.
-        run.end(Ok(()));
-        Ok(())
-    }
-
-    /// Ends a run, and forgets it.
-    pub fn forget(&self, id: &ProgramId) {
-        let run = self.runs.lock().remove(id);
+    /// Ends what runs under this term or an earlier one; nothing where there is no such run. It writes and says nothing more from
+    /// now on, and is gone at its next wait, or within a few ms of running.
+    pub fn stop(&self, id: &ProgramId, term: u64) {
+        let run = self.runs.lock().get(id).filter(|run| run.term <= term).cloned();
         if let Some(run) = run {
             run.gate.end();
             run.end(Ok(()));
+        }
+    }
+
+    /// The same, and forgets it with its lines.
+    pub fn forget(&self, id: &ProgramId, term: u64) {
+        self.stop(id, term);
+        let mut runs = self.runs.lock();
+        if runs.get(id).is_some_and(|run| run.term <= term) {
+            runs.remove(id);
         }
     }
 
@@ -194,14 +193,6 @@ impl Runner {
             runtime.shutdown_background();
         }
         self.timer.close();
-    }
-
-    fn get(&self, id: &ProgramId) -> Result<Arc<Run>, Error> {
-        self.runs
-            .lock()
-            .get(id)
-            .cloned()
-            .ok_or_else(|| Error::NotHere(id.clone()))
     }
 }
 

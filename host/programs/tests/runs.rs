@@ -4,7 +4,10 @@
 use std::{
     collections::BTreeMap,
     path::PathBuf,
-    sync::{Arc, LazyLock},
+    sync::{
+        Arc, LazyLock,
+        atomic::{AtomicU64, Ordering},
+    },
     time::{Duration, Instant},
 };
 
@@ -13,7 +16,7 @@ use bumpless_core::{
     program::{Status, Wanted},
 };
 use bumpless_engine::{Answer, Config, Engine, Later, PreparedProgram, Question, Reply, Script, Sight, wrap};
-use bumpless_programs::{Exchange, Order, Reach, RunView, Runner};
+use bumpless_programs::{Error, Exchange, Order, Reach, RunView, Runner};
 use parking_lot::Mutex;
 
 static COMPONENTS: LazyLock<PathBuf> = LazyLock::new(|| xtask::components::build().unwrap());
@@ -112,6 +115,7 @@ fn spec(name: &str, grants: &[(&str, bool)]) -> ProgramSpec {
 struct Bench {
     runner: Runner,
     home: Arc<Home>,
+    terms: AtomicU64,
 }
 
 impl Bench {
@@ -125,6 +129,7 @@ impl Bench {
         Self {
             runner,
             home: Arc::new(home),
+            terms: AtomicU64::new(1),
         }
     }
 
@@ -132,7 +137,7 @@ impl Bench {
         let id = spec.id.clone();
         let order = Order {
             spec,
-            term: 1,
+            term: self.terms.fetch_add(1, Ordering::Relaxed),
             prepared,
             checkpoint,
             reach: Arc::clone(&self.home) as Arc<dyn Reach>,
@@ -175,7 +180,8 @@ fn a_program_that_spins_is_paused_resumed_and_stopped() {
     for prepared in [guest("spin"), lua("while true do end")] {
         let id = bench.run(spec("spins", &[]), prepared, None);
         bench.until(&id, |view| view.used_ns > 20_000_000);
-        bench.runner.pause(&id, true).unwrap();
+        let term = bench.view(&id).term;
+        bench.runner.pause(&id, term, true).unwrap();
         assert_eq!(bench.view(&id).status, Status::Paused);
         // It stands still: once it has come to its wait, it uses nothing.
         let mut before = bench.view(&id).used_ns;
@@ -187,14 +193,40 @@ fn a_program_that_spins_is_paused_resumed_and_stopped() {
             }
             before = now;
         }
-        bench.runner.pause(&id, false).unwrap();
+        bench.runner.pause(&id, term, false).unwrap();
         bench.until(&id, |view| {
             view.status == Status::Running && view.used_ns > before + 5_000_000
         });
-        bench.runner.stop(&id).unwrap();
+        bench.runner.stop(&id, u64::MAX);
         assert_eq!(bench.view(&id).status, Status::Stopped);
-        bench.runner.forget(&id);
+        bench.runner.forget(&id, u64::MAX);
     }
+}
+
+#[test]
+fn a_run_that_has_ended_begins_again_only_under_another_term() {
+    let bench = Bench::new(&[]);
+    let id = bench.run(spec("once", &[]), guest("nonsense"), None);
+    let ended = bench.until(&id, |view| view.status == Status::Fault);
+    let order = |term| Order {
+        spec: spec("once", &[]),
+        term,
+        prepared: guest("spin"),
+        checkpoint: None,
+        reach: Arc::clone(&bench.home) as Arc<dyn Reach>,
+        paused: true,
+    };
+    assert!(matches!(bench.runner.run(order(ended.term)), Err(Error::Runs(..))));
+    assert_eq!(bench.view(&id).status, Status::Fault);
+    bench.runner.run(order(ended.term + 5)).unwrap();
+    assert_eq!(bench.view(&id).status, Status::Paused, "it begins paused");
+    // Words about earlier terms do not concern it.
+    bench.runner.stop(&id, ended.term);
+    bench.runner.forget(&id, ended.term + 4);
+    assert!(bench.runner.pause(&id, ended.term, false).is_err());
+    assert_eq!(bench.view(&id).status, Status::Paused);
+    bench.runner.stop(&id, ended.term + 5);
+    assert_eq!(bench.view(&id).status, Status::Stopped);
 }
 
 #[test]
@@ -206,7 +238,7 @@ fn a_program_keeps_to_its_share_and_its_memory() {
     let view = bench.until(&id, |view| view.up_ms > 1_000);
     // At least the pauses were kept; a busy machine gives less.
     assert!(view.used_ns < 400_000_000, "{view:?}");
-    bench.runner.stop(&id).unwrap();
+    bench.runner.stop(&id, u64::MAX);
     for (words, part) in [
         ("grow", "of memory; at most 8388608 are given"),
         ("trap", "trapped"),
@@ -224,10 +256,10 @@ fn a_run_goes_on_from_the_last_checkpoint() {
     let counts = guest("count 1");
     let id = bench.run(spec("counts", &[("out", true)]), Arc::clone(&counts), None);
     bench.until(&id, |_| bench.home.saved.lock().len() >= 5);
-    bench.runner.stop(&id).unwrap();
+    bench.runner.stop(&id, u64::MAX);
     let saved = bench.home.saved.lock().last().cloned().unwrap();
     let count = u64::from_le_bytes(saved.clone().try_into().unwrap());
-    bench.runner.forget(&id);
+    bench.runner.forget(&id, u64::MAX);
     bench.home.written.lock().clear();
     bench.run(spec("counts", &[("out", true)]), counts, Some(saved));
     bench.until(&id, |_| !bench.home.written.lock().is_empty());
@@ -279,7 +311,7 @@ fn two_scripts_talk_and_pins_are_points() {
     bench.until(&taker, |_| bench.home.written.lock().contains(&21.0));
     for id in [sender, taker] {
         assert_eq!(bench.view(&id).status, Status::Running);
-        bench.runner.stop(&id).unwrap();
+        bench.runner.stop(&id, u64::MAX);
     }
     let echo = bench.run(spec("echo", &[]), guest("echo"), None);
     let hears = bench.run(
@@ -296,7 +328,7 @@ fn two_scripts_talk_and_pins_are_points() {
         bench.view(&hears).status == Status::Stopped
     });
     assert_eq!(bench.lines(&hears), ["over"]);
-    bench.runner.stop(&echo).unwrap();
+    bench.runner.stop(&echo, u64::MAX);
     let asks = bench.run(spec("asks", &[]), guest("ask"), None);
     bench.until(&asks, |view| view.status == Status::Stopped);
     assert_eq!(bench.lines(&asks), ["out = 50"]);

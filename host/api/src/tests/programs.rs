@@ -26,6 +26,7 @@ fn program(id: ProgramId, status: Status) -> ProgramView {
     ProgramView {
         run: Some(RunTold {
             id: id.clone(),
+            home: host(),
             term: 3,
             status,
             reason: String::new(),
@@ -52,6 +53,7 @@ fn program(id: ProgramId, status: Status) -> ProgramView {
         status,
         reason: String::new(),
         checkpoint_bytes: Some(3),
+        standbys: vec![host()],
     }
 }
 

@@ -201,6 +201,8 @@ pub struct Program {
     pub lines_dropped: Option<u64>,
     /// Bytes of its checkpoint.
     pub checkpoint_bytes: Option<u64>,
+    /// Hosts that keep copies of it with its checkpoint, the first of which goes on with it when its home is gone.
+    pub standbys: Vec<String>,
 }
 
 impl From<ProgramView> for Program {
@@ -245,6 +247,7 @@ impl From<ProgramView> for Program {
             lines: run.map(|run| run.lines.0),
             lines_dropped: run.map(|run| run.lines.1),
             checkpoint_bytes: view.checkpoint_bytes,
+            standbys: view.standbys.iter().map(ToString::to_string).collect(),
         }
     }
 }

@@ -129,6 +129,9 @@ fn one(json: bool, answer: &Answer) -> Result<(), Error> {
         program.term,
         program.home
     ))?;
+    if !program.standbys.is_empty() {
+        show::line(&format!("  copies at {}", program.standbys.join(", ")))?;
+    }
     for (name, grant) in &program.grants {
         let raw = grant
             .raw

@@ -3,7 +3,7 @@
 //! Never: decides; the home does.
 
 use bumpless_core::{HostId, PointId, ProgramId};
-use futures_util::future::join_all;
+use futures_util::{StreamExt as _, future::join_all, stream::FuturesUnordered};
 use serde_json::{Value, json};
 
 use super::{Deploy, unexpected};
@@ -55,13 +55,27 @@ impl Deploy {
         if room.programs.desks.lock().contains_key(id) {
             return Ok(room.here.clone());
         }
-        let list = Self::list_programs(room).await;
-        let home = list
-            .programs
-            .iter()
-            .find(|view| view.spec.id == *id)
-            .map(|view| view.spec.home.clone());
-        home.ok_or_else(|| match list.silent.first() {
+        let copy = room.programs.copies.lock().get(id).map(|copy| copy.desk.spec.home.clone());
+        let mut silent = copy
+            .filter(|home| !room.roster.there(home))
+            .map(|home| (home, "it is away".to_owned()));
+        let mut asked: FuturesUnordered<_> = room
+            .roster
+            .others()
+            .into_iter()
+            .map(|host| async move {
+                let answer = Self::of_programs(room, &host, ProgramAsk::Find(id.clone()), STAGE_WAIT).await;
+                (host, answer)
+            })
+            .collect();
+        while let Some((host, answer)) = asked.next().await {
+            match answer {
+                Ok(_) => return Ok(host),
+                Err(Error::NotFound(_)) => {}
+                Err(error) => silent = Some((host, error.to_string())),
+            }
+        }
+        Err(match silent {
             Some((host, reason)) => Error::unreachable(
                 format!("program {id} may be at home at host {host}, which did not answer: {reason}"),
                 "wait until the host is back",
@@ -104,14 +118,26 @@ impl Deploy {
         let room = self.room.clone();
         let work = async move {
             let end = async {
+                let id = ProgramId::new(&draft.name).map_err(|error| Error::invalid(error.to_string(), ""))?;
+                let now = match Self::program_home(&room, &id).await {
+                    Ok(home) => Some(home),
+                    Err(Error::NotFound(_)) => None,
+                    Err(error) => return Err(error),
+                };
                 let home = match draft.grants.values().next() {
-                    None => room.here.clone(),
+                    None => now.clone().unwrap_or_else(|| room.here.clone()),
                     Some(grant) => {
                         let point =
                             PointId::new(&grant.point).map_err(|error| Error::invalid(error.to_string(), ""))?;
                         room.host_of(&point).await?
                     }
                 };
+                if let Some(now) = now.filter(|now| *now != home) {
+                    return Err(Error::refused(
+                        format!("there is a program {id}, and its points are those of host {now}"),
+                        "remove it first, or choose another name",
+                    ));
+                }
                 one(Self::of_programs(&room, &home, ProgramAsk::Create(Box::new(draft)), APPLY_WAIT * 2).await?)
             }
             .await;

@@ -18,6 +18,7 @@ use crate::{
 fn told(view: RunView) -> RunTold {
     RunTold {
         id: view.id,
+        home: view.home,
         term: view.term,
         status: view.status,
         reason: view.reason,
@@ -32,6 +33,11 @@ impl Room {
     /// What runs here.
     pub(super) fn program_runs(&self) -> Vec<RunTold> {
         self.programs.runner.views().into_iter().map(told).collect()
+    }
+
+    /// How one of them is; none where it did not run here.
+    pub(super) fn program_run_of(&self, id: &ProgramId) -> Option<RunTold> {
+        self.programs.runner.view(id).map(told)
     }
 
     /// Runs a program for its home.
@@ -81,18 +87,11 @@ impl Room {
         }
     }
 
-    pub(super) fn program_pause(&self, id: &ProgramId, paused: bool) -> Result<(), Error> {
+    pub(super) fn program_pause(&self, id: &ProgramId, term: u64, paused: bool) -> Result<(), Error> {
         self.programs
             .runner
-            .pause(id, paused)
+            .pause(id, term, paused)
             .map_err(|error| Error::not_found(chain(&error), ""))
-    }
-
-    /// Ends a run; nothing where there is none.
-    pub(super) fn program_end(&self, id: &ProgramId) {
-        if let Err(error) = self.programs.runner.stop(id) {
-            tracing::debug!(%error, "a program that shall end does not run");
-        }
     }
 
     pub(super) fn program_lines(&self, id: &ProgramId, after: u64, max: u32) -> Vec<LineView> {
