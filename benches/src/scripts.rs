@@ -18,8 +18,8 @@ use std::{
 
 use bumpless_core::{Fault, LogLevel, Message, Reading};
 use bumpless_engine::{
-    Answer, Config, Engine, Later, PreparedProgram, ProgramSlot, Question, Reply, Script, Sight, Surroundings, Turn, Usage,
-    wrap,
+    Answer, Config, Engine, Later, PreparedProgram, ProgramSlot, Question, Reply, Script, Sight, Surroundings, Turn,
+    Usage, wrap,
 };
 use bumpless_io::sim::{Model, PlantSettings, Stock, model::stock};
 use parking_lot::Mutex;
@@ -446,7 +446,9 @@ impl Scripts {
                     continue;
                 }
                 if let Poll::Ready(end) = run.as_mut().poll(&mut Context::from_waker(Waker::noop())) {
-                    let why = end.err().map_or_else(|| "it came to its end".to_owned(), |fault| fault.to_string());
+                    let why = end
+                        .err()
+                        .map_or_else(|| "it came to its end".to_owned(), |fault| fault.to_string());
                     return Err(Error::Wish(format!("a script stopped in {}: {why}", trial.key)));
                 }
             }
@@ -491,7 +493,12 @@ pub(crate) fn run(folder: &Path, report: &mut Report) -> Result<(), Error> {
     let together = together.map_or(&[][..], |(_, curve)| curve);
     let apart = difference(&alone, together);
     let most = apart.iter().map(|(_, d)| d.abs()).fold(0.0, f64::max);
-    report.figure("scripts.distributed_apart_max", most, "% of span", Bound::AtMost(APART_MAX));
+    report.figure(
+        "scripts.distributed_apart_max",
+        most,
+        "% of span",
+        Bound::AtMost(APART_MAX),
+    );
     let bad = |error: Box<dyn std::error::Error + Send + Sync>| Error::Picture(error.to_string());
     for (name, distributed) in [("scripts-central.svg", false), ("scripts-distributed.svg", true)] {
         let panels: Vec<Panel> = curves

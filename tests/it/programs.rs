@@ -1,9 +1,16 @@
 //! Free-running programs on real hosts: paused while they spin, kill -9 of their owner and of their home, and the published 3C
 //! scripts on a simulated process, central and distributed.
 
-use std::{fs, time::Duration};
+use std::{
+    fs,
+    time::{Duration, Instant},
+};
 
-use bumpless_tests::{Api, Binary, Cell, CellOptions, components, wait_until};
+use bumpless_tests::{
+    Api, Binary, Cell, CellOptions, components,
+    masters::{LOOP, TwoMasters},
+    wait_until,
+};
 use serde_json::{Value, json};
 
 use crate::{number, one_writer, text, whole};
@@ -129,7 +136,10 @@ fn a_program_without_points_goes_on_where_its_home_is_killed_and_its_old_home_le
             at_a.post("/v1/programs", &draft).map_err(|error| error.to_string())
         })
         .unwrap();
-        assert_eq!((text(&created["home"]), text(&created["owner"])), ("a".to_owned(), "a".to_owned()));
+        assert_eq!(
+            (text(&created["home"]), text(&created["owner"])),
+            ("a".to_owned(), "a".to_owned())
+        );
     }
     let before = until(&api, "counts", "a standby and a checkpoint", |now| {
         now["standbys"].as_array().is_some_and(|hosts| !hosts.is_empty()) && now["checkpoint_bytes"].as_u64() >= Some(2)
@@ -138,7 +148,10 @@ fn a_program_without_points_goes_on_where_its_home_is_killed_and_its_old_home_le
         text(&now["status"]) == "stopped" && !now["standbys"].as_array().unwrap().is_empty()
     });
     // A name is one program's, wherever it is asked for.
-    let refused = api.ask("DELETE", "/v1/components/counts", None).unwrap_err().to_string();
+    let refused = api
+        .ask("DELETE", "/v1/components/counts", None)
+        .unwrap_err()
+        .to_string();
     assert!(refused.contains("is used by program counts"), "{refused}");
     let mut counted = 0;
     wait_until("the standby has counted too", Duration::from_secs(60), || {
@@ -187,6 +200,49 @@ fn a_program_without_points_goes_on_where_its_home_is_killed_and_its_old_home_le
         used.map(drop).map_err(|error| error.to_string())
     })
     .unwrap();
+}
+
+#[test]
+fn a_program_goes_over_with_the_mastership_of_its_device() {
+    let mut rig = TwoMasters::start(150).unwrap();
+    let first = rig.writes().last().unwrap().master;
+    let other = 1 - first;
+    let (api, there) = (rig.api(first).unwrap(), rig.api(other).unwrap());
+    api.delete(&format!("/v1/loops/{LOOP}")).unwrap();
+    upload(&api, "programs/lua3c.wasm", "");
+    let counts = b"local n = tonumber(bl.restore() or '0')
+        while true do n = n + 1 h3c.aOut(0, n % 9000) bl.save(tostring(n)) o3c.dms(20) end";
+    script(&api, "counts", counts);
+    let draft = json!({"name": "counts", "component": "counts",
+        "grants": {"aout-0": {"point": "line.valve", "write": true}}});
+    wait_until("the point is free", Duration::from_secs(60), || {
+        api.post("/v1/programs", &draft).map_err(|error| error.to_string())
+    })
+    .unwrap();
+    wait_until("the other master has code and copy", Duration::from_secs(60), || {
+        let now = show(&api, "counts");
+        let copied = now["standbys"].as_array().is_some_and(|hosts| hosts.len() == 1);
+        match there.get("/v1/components/counts") {
+            Ok(_) if copied && now["checkpoint_bytes"].as_u64() >= Some(2) => Ok(()),
+            _ => Err(now.to_string()),
+        }
+    })
+    .unwrap();
+    let counted = saved(&api);
+    let at = Instant::now();
+    rig.hosts[first].kill9();
+    rig.wait_written_by(other, at).unwrap();
+    let home = format!("io-{}", other + 1);
+    until(&there, "counts", "the other home", |now| {
+        text(&now["home"]) == home && text(&now["status"]) == "running"
+    });
+    wait_until("it counts on", Duration::from_secs(60), || {
+        let now = saved(&there);
+        if now > counted { Ok(()) } else { Err(now) }
+    })
+    .unwrap();
+    let overlaps = rig.overlaps();
+    assert!(overlaps.is_empty(), "{overlaps:?}");
 }
 
 fn saved(api: &Api) -> u64 {

@@ -7,6 +7,8 @@ use std::{
     time::Instant,
 };
 
+use bumpless_core::program::Status;
+
 use crate::{alarms::AlarmLoad, room::Room, view::Counters};
 
 impl Room {
@@ -20,7 +22,13 @@ impl Room {
             .as_ref()
             .map(|archive| archive.counts())
             .unwrap_or_default();
+        let runs = self.programs.runner.views();
+        let in_status = |statuses: &[Status]| runs.iter().filter(|run| statuses.contains(&run.status)).count() as u64;
         let mut counters = Counters {
+            programs_home: self.programs.desks.lock().len() as u64,
+            programs_running: in_status(&[Status::Running, Status::Paused]),
+            programs_faulted: in_status(&[Status::Fault]),
+            programs_copied: self.programs.copies.lock().len() as u64,
             hosts_alive: self
                 .roster
                 .all()

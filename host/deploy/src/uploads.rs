@@ -247,7 +247,7 @@ impl Room {
     }
 
     /// Removes a component from the library of the cell.
-    pub(crate) async fn remove_component(&self, reference: &str) -> Result<(), Error> {
+    pub(crate) async fn remove_component(self: &Arc<Self>, reference: &str) -> Result<(), Error> {
         let _admission = self.admission.lock().await;
         let info = self.library.resolve(reference)?;
         let users = self.book.users().remove(&info.digest).unwrap_or_default();

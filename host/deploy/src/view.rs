@@ -313,6 +313,14 @@ pub struct Counters {
     pub loops_held: u64,
     /// Loops owned here (as of now).
     pub loops_owned: u64,
+    /// Programs whose home is here (as of now).
+    pub programs_home: u64,
+    /// Programs that run here or stand paused (as of now).
+    pub programs_running: u64,
+    /// Programs whose last run here ended in a fault (as of now).
+    pub programs_faulted: u64,
+    /// Programs of other homes that are copied here (as of now).
+    pub programs_copied: u64,
     /// Components in the library (as of now).
     pub components: u64,
     /// Records that reached this host, own ones included.

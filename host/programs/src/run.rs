@@ -158,10 +158,6 @@ impl Run {
         }
     }
 
-    pub(crate) fn is_over(&self) -> bool {
-        self.ended.lock().is_some()
-    }
-
     pub(crate) fn view(&self) -> RunView {
         let (status, reason) = match &*self.ended.lock() {
             Some(Ok(())) => (Status::Stopped, String::new()),

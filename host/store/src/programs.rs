@@ -118,6 +118,10 @@ mod tests {
         let store = Store::open(folder.path()).unwrap();
         assert_eq!(store.programs::<u64>().unwrap(), [("a".to_owned(), 3)]);
         assert_eq!(store.program::<u64>("a").unwrap(), Some(3));
-        assert_eq!(store.program::<String>("a").unwrap(), None, "a row of another shape is skipped");
+        assert_eq!(
+            store.program::<String>("a").unwrap(),
+            None,
+            "a row of another shape is skipped"
+        );
     }
 }

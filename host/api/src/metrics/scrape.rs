@@ -128,6 +128,22 @@ impl Collector for Scrape {
             ("loops_home", "Loops whose home is here", c.loops_home),
             ("loops_held", "Loops held here, owned or standing by", c.loops_held),
             ("loops_owned", "Loops owned here", c.loops_owned),
+            ("programs_home", "Programs whose home is here", c.programs_home),
+            (
+                "programs_running",
+                "Programs that run here, or stand paused",
+                c.programs_running,
+            ),
+            (
+                "programs_faulted",
+                "Programs whose last run here ended in a fault",
+                c.programs_faulted,
+            ),
+            (
+                "programs_copied",
+                "Programs of other homes that are copied here",
+                c.programs_copied,
+            ),
             ("components", "Components in the library", c.components),
             (
                 "audit_entries_waiting",

@@ -55,7 +55,12 @@ impl Deploy {
         if room.programs.desks.lock().contains_key(id) {
             return Ok(room.here.clone());
         }
-        let copy = room.programs.copies.lock().get(id).map(|copy| copy.desk.spec.home.clone());
+        let copy = room
+            .programs
+            .copies
+            .lock()
+            .get(id)
+            .map(|copy| copy.desk.spec.home.clone());
         let mut silent = copy
             .filter(|home| !room.roster.there(home))
             .map(|home| (home, "it is away".to_owned()));

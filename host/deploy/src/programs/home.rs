@@ -14,7 +14,8 @@ use bumpless_core::{
 };
 
 use super::{
-    Desk, Kept, LineView, PROGRAMS_MAX, ProgramAsk, ProgramDraft, ProgramOrder, ProgramTold, ProgramView, Row, no_program,
+    Desk, Kept, LineView, PROGRAMS_MAX, ProgramAsk, ProgramDraft, ProgramOrder, ProgramTold, ProgramView, Row,
+    no_program,
 };
 use crate::{book::on_disk, error::Error, room::Room};
 
@@ -215,7 +216,10 @@ impl Room {
     pub(super) fn program_sure(&self, id: &ProgramId) -> Result<(), Error> {
         match self.programs.desks.lock().get(id) {
             Some(kept) if !kept.sure => Err(Error::busy(
-                format!("host {} has just started and asks the standbys of program {id}", self.here),
+                format!(
+                    "host {} has just started and asks the standbys of program {id}",
+                    self.here
+                ),
                 "ask again in a few seconds",
             )),
             _ => Ok(()),

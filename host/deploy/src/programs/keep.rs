@@ -26,6 +26,9 @@ use crate::{
     wire::{Ask, Told},
 };
 
+/// Programs that are brought to where they shall be at a time: each waits for its owner.
+const SETTLED_AT_ONCE: usize = 8;
+
 /// A desk at one look.
 struct Look {
     id: ProgramId,
@@ -76,12 +79,11 @@ impl Room {
         }
         let (owner, term) = (desk.fence.owner.clone(), desk.fence.term);
         let run = self.program_run_at(&owner, id).await.flatten();
-        let asks = next(&desk, run.filter(|run| run.term == term).as_ref());
-        let mut end = Ok(());
-        for ask in asks {
-            end = end.and(self.program_tell(&owner, ask).await.map(drop));
-        }
-        let hindrance = end.err().map(|error| error.to_string()).unwrap_or_default();
+        let hindrance = match next(&desk, run.filter(|run| run.term == term).as_ref()) {
+            Some(ask) => self.program_tell(&owner, ask).await.err(),
+            None => None,
+        };
+        let hindrance = hindrance.map(|error| error.to_string()).unwrap_or_default();
         if let Some(Some(run)) = self.program_run_at(&owner, id).await {
             self.programs_hear(&owner, &[run]).await;
         }
@@ -185,12 +187,15 @@ impl Room {
             alive.map(look).collect()
         };
         let eligible: Vec<HostId> = self.roster.eligible().into_iter().map(|c| c.host).collect();
-        for look in looks {
-            if !eligible.contains(&look.fence.owner) {
-                self.program_move(&look).await;
-            } else if look.asks {
-                self.program_settle(&look.id).await;
-            }
+        for some in looks.chunks(SETTLED_AT_ONCE) {
+            join_all(some.iter().map(|look| async {
+                if !eligible.contains(&look.fence.owner) {
+                    self.program_move(look).await;
+                } else if look.asks {
+                    self.program_settle(&look.id).await;
+                }
+            }))
+            .await;
         }
     }
 

@@ -444,7 +444,10 @@ mod tests {
             unit: String::new(),
         };
         copy.desk.spec.grants.insert("x".into(), grant);
-        assert!(!copy.is_free(false, Mastery::Alone, later + 9 * PROGRAM_HOME_AWAY), "its points are gone");
+        assert!(
+            !copy.is_free(false, Mastery::Alone, later + 9 * PROGRAM_HOME_AWAY),
+            "its points are gone"
+        );
         assert!(!copy.is_free(true, Mastery::Away, now));
         assert!(copy.is_free(true, Mastery::Master(1), now));
     }
