@@ -8,6 +8,8 @@
 //! The published tank was another one, and no numbers of it are given; what its text says of each curve is what is judged.
 //! Owns: the experiments and their pictures. Never: changes a script, or draws what the plant did not show.
 
+mod trials;
+
 use std::{
     collections::VecDeque,
     future::poll_fn,
@@ -25,6 +27,7 @@ use bumpless_io::sim::{Model, PlantSettings, Stock, model::stock};
 use parking_lot::Mutex;
 use plotters::prelude::*;
 
+use self::trials::{CENTRAL, DISTRIBUTED, Event, Trial};
 use crate::{
     error::Error,
     report::{Bound, Report},
@@ -34,10 +37,6 @@ const LEVEL: &[u8] = include_bytes!("../../programs/lua3c/scripts/level.lua");
 const ACTUATOR: &[u8] = include_bytes!("../../programs/lua3c/scripts/level-actuator.lua");
 const TRANSMITTER: &[u8] = include_bytes!("../../programs/lua3c/scripts/level-transmitter.lua");
 
-/// The hand valve out of the tank, in %: `open` is as far as the pump can still hold 95 % of level against it.
-const OPEN: f64 = 60.0;
-const PARTLY: f64 = 35.0;
-const A_LITTLE_LESS: f64 = 50.0;
 /// Time before an experiment, for the level to come to rest at its first setpoint, in s.
 const REST_S: f64 = 240.0;
 /// Start of the actuator, after the transmitter's: its first line needs messages that were sent before it, in ns.
@@ -53,94 +52,6 @@ const MEMORY_BYTES: usize = 8 << 20;
 const NEAR: f64 = 1.0;
 /// How far the distributed curve may be from the central one, in % of span: one period of the transmitter at the steepest rise.
 const APART_MAX: f64 = 2.0;
-
-#[derive(Debug, Clone, Copy)]
-enum Event {
-    Setpoint(f64),
-    Valve(f64),
-}
-
-struct Trial {
-    key: &'static str,
-    title: &'static str,
-    distributed: bool,
-    setpoint: f64,
-    valve: f64,
-    /// When, in s after the beginning, and what.
-    events: &'static [(f64, Event)],
-    seconds: f64,
-}
-
-const CENTRAL: [Trial; 4] = [
-    Trial {
-        key: "central.open",
-        title: "23 to 50 %, valve open",
-        distributed: false,
-        setpoint: 23.0,
-        valve: OPEN,
-        events: &[(10.0, Event::Setpoint(50.0))],
-        seconds: 150.0,
-    },
-    Trial {
-        key: "central.partly",
-        title: "23 to 50 %, valve partly shut",
-        distributed: false,
-        setpoint: 23.0,
-        valve: PARTLY,
-        events: &[(10.0, Event::Setpoint(50.0))],
-        seconds: 150.0,
-    },
-    Trial {
-        key: "central.high",
-        title: "50 to 95 %, valve partly shut",
-        distributed: false,
-        setpoint: 50.0,
-        valve: PARTLY,
-        events: &[(10.0, Event::Setpoint(95.0))],
-        seconds: 200.0,
-    },
-    Trial {
-        key: "central.outflow",
-        title: "95 %: valve opened at 22 s, a little less at 121 s",
-        distributed: false,
-        setpoint: 95.0,
-        valve: PARTLY,
-        events: &[(22.0, Event::Valve(OPEN)), (121.0, Event::Valve(A_LITTLE_LESS))],
-        seconds: 200.0,
-    },
-];
-
-const DISTRIBUTED: [Trial; 3] = [
-    Trial {
-        key: "distributed.steps",
-        title: "23 to 51 to 89 %, valve open",
-        distributed: true,
-        setpoint: 23.0,
-        valve: OPEN,
-        events: STEPS,
-        seconds: 320.0,
-    },
-    Trial {
-        key: "distributed.down",
-        title: "89 to 30 %, valve open",
-        distributed: true,
-        setpoint: 89.0,
-        valve: OPEN,
-        events: &[(10.0, Event::Setpoint(30.0))],
-        seconds: 200.0,
-    },
-    Trial {
-        key: "distributed.outflow",
-        title: "46 %: valve a little less, then open",
-        distributed: true,
-        setpoint: 46.0,
-        valve: A_LITTLE_LESS,
-        events: &[(20.0, Event::Valve(PARTLY)), (40.0, Event::Valve(OPEN))],
-        seconds: 160.0,
-    },
-];
-
-const STEPS: &[(f64, Event)] = &[(10.0, Event::Setpoint(51.0)), (150.0, Event::Setpoint(89.0))];
 
 /// One line of a script's output, as the plant was then.
 #[derive(Debug, Clone, Copy)]
