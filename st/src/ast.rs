@@ -141,7 +141,6 @@ pub(crate) enum TypeKind {
     Array(Vec<(Expr, Expr)>, Box<TypeRef>),
     Struct(Vec<Declaration>),
     Enum(Vec<(Name, Option<Expr>)>),
-    Wrong,
 }
 
 #[derive(Debug, Clone)]

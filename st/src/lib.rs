@@ -68,6 +68,14 @@ pub struct Compiled {
 /// # Errors
 /// [`Error::Source`] with every place that is wrong; the others name a limit.
 pub fn compile(source: &str) -> Result<Compiled, Error> {
+    compile_as(source, None)
+}
+
+/// As [`compile`], with another version than the text's: three numbers, as in `1.0.0`.
+///
+/// # Errors
+/// As [`compile`].
+pub fn compile_as(source: &str, version: Option<&str>) -> Result<Compiled, Error> {
     if source.len() > SOURCE_BYTES_MAX {
         return Err(Error::TooLong {
             bytes: source.len(),
@@ -82,9 +90,12 @@ pub fn compile(source: &str) -> Result<Compiled, Error> {
     if !sink.is_empty() {
         return Err(Error::Source(sink.finish(source)));
     }
-    let Some(checked) = check::check(&library, &file, source, &mut sink) else {
+    let Some(mut checked) = check::check(&library, &file, source, &mut sink) else {
         return Err(Error::Source(sink.finish(source)));
     };
+    if let Some(version) = version {
+        version.clone_into(&mut checked.interface.version);
+    }
     let (component, layout) = emit::emit(&checked)?;
     let interface = checked.interface;
     Ok(Compiled {

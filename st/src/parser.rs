@@ -59,6 +59,10 @@ pub(crate) fn parse(source: &str, sink: &mut Sink) -> File {
         end: source.len() as u32,
     };
     let tokens = tokens(source, whole, sink);
+    // What is no token leaves a hole, and everything behind it would be said to be wrong.
+    if !sink.is_empty() {
+        return File::default();
+    }
     let mut parser = Parser {
         source,
         tokens,

@@ -4,6 +4,7 @@
 
 pub(crate) mod alarms;
 pub(crate) mod audit;
+pub(crate) mod author;
 pub(crate) mod components;
 pub(crate) mod curves;
 pub(crate) mod history;

@@ -7,6 +7,7 @@
 //! Never: disturbs the loop; whoever watches too slowly is told how many records were lost.
 
 mod alarms;
+mod dev;
 mod feed;
 mod lines;
 mod screen;
@@ -22,6 +23,7 @@ use crate::{
     error::Error,
 };
 pub(crate) use alarms::alarms;
+pub(crate) use dev::run as dev;
 use story::Story;
 
 /// Follows a loop until the reader has seen enough.

@@ -78,7 +78,6 @@ impl<'a> Checker<'a> {
     /// The type of a reference and its first value. `name` is what a structure or enumeration is called.
     pub(super) fn type_of(&mut self, ty: &ast::TypeRef, name: Option<&str>) -> (Ty, Vec<u8>) {
         match &ty.kind {
-            TypeKind::Wrong => (Ty::Wrong, Vec::new()),
             TypeKind::Named(name) => self.named_type(name),
             TypeKind::Array(ranges, of) => self.array(ranges, of, ty.span),
             TypeKind::Struct(fields) => self.structure(fields, name.unwrap_or("STRUCT")),

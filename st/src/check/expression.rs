@@ -168,7 +168,7 @@ impl Checker<'_> {
             .scope
             .keys()
             .chain(self.globals.keys())
-            .filter(|known| distance(known, &name.upper) <= 1 + name.upper.len() / 5)
+            .filter(|known| distance(known, &name.upper) <= name.upper.len() / 3)
             .min_by_key(|known| (distance(known, &name.upper), (*known).clone()))
             .cloned();
         let mut text = format!("there is no variable {}", name.upper);

@@ -229,7 +229,7 @@ impl Checker<'_> {
                 None => self.error(span, format!("there is no input {of}")),
             }
         }
-        if !made.ports.iter().any(|port| port.output) {
+        if self.sink.is_empty() && !made.ports.iter().any(|port| port.output) {
             self.error(ast.name.span, "a controller moves something: declare at least one VAR_OUTPUT");
         }
         if made.ports.len() > PORTS_MAX {
