@@ -240,16 +240,26 @@ impl<'a> Checker<'a> {
         let programs: Vec<usize> = ours
             .iter()
             .copied()
-            .filter(|&n| self.pous.get(n).is_some_and(|pou| pou.ast.kind == ast::PouKind::Program))
+            .filter(|&n| {
+                self.pous
+                    .get(n)
+                    .is_some_and(|pou| pou.ast.kind == ast::PouKind::Program)
+            })
             .collect();
         let start = Span::default();
         match programs.as_slice() {
             [] if self.sink.is_empty() => {
-                self.error(start, "there is no PROGRAM: a controller is one PROGRAM with its blocks and functions");
+                self.error(
+                    start,
+                    "there is no PROGRAM: a controller is one PROGRAM with its blocks and functions",
+                );
             }
             [_, second, ..] => {
                 let span = self.pous.get(*second).map_or(start, |pou| pou.ast.name.span);
-                self.error(span, "a second PROGRAM: a controller has one; make this one a FUNCTION_BLOCK");
+                self.error(
+                    span,
+                    "a second PROGRAM: a controller has one; make this one a FUNCTION_BLOCK",
+                );
             }
             _ => {}
         }
@@ -310,7 +320,11 @@ impl<'a> Checker<'a> {
         for &number in ours {
             let mut path = vec![(number, 0_usize)];
             while let Some((here, next)) = path.pop() {
-                let calls = self.pous.get(here).and_then(|pou| pou.body.as_ref()).map(|b| b.calls.as_slice());
+                let calls = self
+                    .pous
+                    .get(here)
+                    .and_then(|pou| pou.body.as_ref())
+                    .map(|b| b.calls.as_slice());
                 let Some(&called) = calls.unwrap_or_default().get(next) else {
                     if let Some(done) = done.get_mut(here) {
                         *done = true;
@@ -321,7 +335,10 @@ impl<'a> Checker<'a> {
                 if path.iter().any(|(on, _)| *on == called) {
                     let Some(pou) = self.pous.get(called) else { continue };
                     let (name, span) = (pou.ast.name.upper.clone(), pou.ast.name.span);
-                    self.error(span, format!("{name} calls itself, at once or through others: use a loop"));
+                    self.error(
+                        span,
+                        format!("{name} calls itself, at once or through others: use a loop"),
+                    );
                 } else if !done.get(called).copied().unwrap_or(true) {
                     path.push((called, 0));
                 }

@@ -16,6 +16,7 @@
 mod body;
 mod helpers;
 mod operation;
+mod state;
 mod world;
 
 use std::borrow::Cow;
@@ -30,7 +31,7 @@ use wit_parser::Resolve;
 
 use crate::{ast::PouKind, check::Checked, error::Error, types::Scalar};
 
-pub(crate) use world::Layout;
+pub(crate) use state::Layout;
 
 /// Where a call's result lies.
 const RESULT_AT: i32 = 16;
@@ -334,7 +335,9 @@ fn module(functions: &Functions, data: &Data, heap: u32) -> Vec<u8> {
     let mut names = NameMap::new();
     for (n, (name, code)) in functions.codes.iter().enumerate() {
         let number = IMPORTS + n as u32;
-        types.ty().function(code.parameters.iter().copied(), code.results.iter().copied());
+        types
+            .ty()
+            .function(code.parameters.iter().copied(), code.results.iter().copied());
         section.function(number);
         names.append(number, name);
     }

@@ -92,7 +92,11 @@ fn compare(op: Op, ordering: Option<std::cmp::Ordering>) -> Option<Value> {
 }
 
 fn whole(op: Op, scalar: Scalar, a: i64, b: i64) -> Option<i64> {
-    let ordering = if is_u64(scalar) { (a as u64).cmp(&(b as u64)) } else { a.cmp(&b) };
+    let ordering = if is_u64(scalar) {
+        (a as u64).cmp(&(b as u64))
+    } else {
+        a.cmp(&b)
+    };
     if let Some(Value::Whole(answer)) = compare(op, Some(ordering)) {
         return Some(answer);
     }

@@ -31,8 +31,8 @@ pub(crate) struct Token {
 
 /// Longer ones first.
 const SYMBOLS: [&str; 25] = [
-    ":=", "=>", "<=", ">=", "<>", "**", "..", "(", ")", "[", "]", ",", ";", ":", ".", "+", "-", "*", "/", "&", "=", "<",
-    ">", "^", "#",
+    ":=", "=>", "<=", ">=", "<>", "**", "..", "(", ")", "[", "]", ",", ";", ":", ".", "+", "-", "*", "/", "&", "=",
+    "<", ">", "^", "#",
 ];
 
 /// Units of durations, longer ones first, in ns.
@@ -111,7 +111,8 @@ impl Lexer<'_> {
             None => {
                 self.at = self.bytes.len();
                 let span = self.span(start);
-                self.sink.error(span, format!("this {what} has no end: close it with `{close}`"));
+                self.sink
+                    .error(span, format!("this {what} has no end: close it with `{close}`"));
             }
         }
     }
@@ -232,7 +233,10 @@ impl Lexer<'_> {
                 }
                 _ => {
                     let span = self.span(start);
-                    self.sink.error(span, "this text has no end: close it with the quote that it begins with");
+                    self.sink.error(
+                        span,
+                        "this text has no end: close it with the quote that it begins with",
+                    );
                     break;
                 }
             }
@@ -251,7 +255,9 @@ impl Lexer<'_> {
                 self.at += 1;
                 continue;
             }
-            let Some(digit) = char::from(byte).to_digit(base) else { break };
+            let Some(digit) = char::from(byte).to_digit(base) else {
+                break;
+            };
             any = true;
             self.at += 1;
             value = value.saturating_mul(i128::from(base)).saturating_add(i128::from(digit));
@@ -278,7 +284,8 @@ impl Lexer<'_> {
         }
         let fraction = self.peek(0) == b'.' && self.peek(1).is_ascii_digit();
         let exponent = |at: u8, next: u8, third: u8| {
-            matches!(at, b'e' | b'E') && (next.is_ascii_digit() || (matches!(next, b'+' | b'-') && third.is_ascii_digit()))
+            matches!(at, b'e' | b'E')
+                && (next.is_ascii_digit() || (matches!(next, b'+' | b'-') && third.is_ascii_digit()))
         };
         if !fraction && !exponent(self.peek(0), self.peek(1), self.peek(2)) {
             return self.integer(start, first);
@@ -312,8 +319,10 @@ impl Lexer<'_> {
                 self.at += 1;
             }
             let span = self.span(start);
-            self.sink
-                .error(span, "this is no number: digits of its base, at most 64 bits, are expected");
+            self.sink.error(
+                span,
+                "this is no number: digits of its base, at most 64 bits, are expected",
+            );
         }
         self.push(start, Kind::Int(value.unwrap_or(0)));
     }
@@ -342,9 +351,10 @@ impl Lexer<'_> {
                 }
             }
             let rest = self.source.get(self.at..).unwrap_or_default().as_bytes();
-            let unit = UNITS
-                .iter()
-                .find(|(unit, _)| rest.get(..unit.len()).is_some_and(|r| r.eq_ignore_ascii_case(unit.as_bytes())));
+            let unit = UNITS.iter().find(|(unit, _)| {
+                rest.get(..unit.len())
+                    .is_some_and(|r| r.eq_ignore_ascii_case(unit.as_bytes()))
+            });
             let (Some(whole), Some((unit, ns))) = (whole, unit) else {
                 good = false;
                 break;

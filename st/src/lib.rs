@@ -18,7 +18,7 @@
 //! assert_eq!((component.name.as_str(), component.version.as_str()), ("half", "1.0.0"));
 //!
 //! let error = bumpless_st::compile("PROGRAM half VAR_OUTPUT out : LREAL; END_VAR out := halve(1.0); END_PROGRAM");
-//! assert_eq!(error.unwrap_err().to_string(), "1:54: there is no function HALVE");
+//! assert_eq!(error.unwrap_err().to_string(), "1:53: there is no function HALVE");
 //! # Ok::<(), bumpless_st::Error>(())
 //! ```
 

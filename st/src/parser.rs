@@ -3,14 +3,12 @@
 //! Recovers at the next semicolon or keyword, so that one slip gives one diagnostic.
 //! Never: recurses deeper than [`DEPTH_MAX`], whatever the text is.
 
+mod declaration;
 mod expression;
 mod statement;
 
 use crate::{
-    ast::{
-        Attribute, AttributeValue, Block, BlockKind, Declaration, Expr, ExprKind, File, Init, InitKind, Name, Pou,
-        PouKind, Retain, TypeDeclaration, TypeKind, TypeRef,
-    },
+    ast::{Attribute, AttributeValue, Block, BlockKind, File, Name, Pou, PouKind, Retain},
     diagnostic::{Sink, Span},
     lexer::{Kind, Token, tokens},
 };
@@ -20,12 +18,68 @@ pub(crate) const DEPTH_MAX: u32 = 64;
 
 /// Words that cannot be names.
 const KEYWORDS: [&str; 62] = [
-    "PROGRAM", "END_PROGRAM", "FUNCTION", "END_FUNCTION", "FUNCTION_BLOCK", "END_FUNCTION_BLOCK", "TYPE", "END_TYPE",
-    "STRUCT", "END_STRUCT", "VAR", "VAR_INPUT", "VAR_OUTPUT", "VAR_IN_OUT", "VAR_TEMP", "VAR_EXTERNAL", "VAR_GLOBAL",
-    "END_VAR", "CONSTANT", "RETAIN", "NON_RETAIN", "PERSISTENT", "ARRAY", "OF", "IF", "THEN", "ELSIF", "ELSE", "END_IF", "CASE", "END_CASE",
-    "FOR", "TO", "BY", "DO", "END_FOR", "WHILE", "END_WHILE", "REPEAT", "UNTIL", "END_REPEAT", "EXIT", "CONTINUE",
-    "RETURN", "AND", "OR", "XOR", "NOT", "MOD", "TRUE", "FALSE", "AT", "CONFIGURATION", "RESOURCE", "CLASS", "INTERFACE",
-    "METHOD", "NAMESPACE", "POINTER", "REF_TO", "STRING", "WSTRING",
+    "PROGRAM",
+    "END_PROGRAM",
+    "FUNCTION",
+    "END_FUNCTION",
+    "FUNCTION_BLOCK",
+    "END_FUNCTION_BLOCK",
+    "TYPE",
+    "END_TYPE",
+    "STRUCT",
+    "END_STRUCT",
+    "VAR",
+    "VAR_INPUT",
+    "VAR_OUTPUT",
+    "VAR_IN_OUT",
+    "VAR_TEMP",
+    "VAR_EXTERNAL",
+    "VAR_GLOBAL",
+    "END_VAR",
+    "CONSTANT",
+    "RETAIN",
+    "NON_RETAIN",
+    "PERSISTENT",
+    "ARRAY",
+    "OF",
+    "IF",
+    "THEN",
+    "ELSIF",
+    "ELSE",
+    "END_IF",
+    "CASE",
+    "END_CASE",
+    "FOR",
+    "TO",
+    "BY",
+    "DO",
+    "END_FOR",
+    "WHILE",
+    "END_WHILE",
+    "REPEAT",
+    "UNTIL",
+    "END_REPEAT",
+    "EXIT",
+    "CONTINUE",
+    "RETURN",
+    "AND",
+    "OR",
+    "XOR",
+    "NOT",
+    "MOD",
+    "TRUE",
+    "FALSE",
+    "AT",
+    "CONFIGURATION",
+    "RESOURCE",
+    "CLASS",
+    "INTERFACE",
+    "METHOD",
+    "NAMESPACE",
+    "POINTER",
+    "REF_TO",
+    "STRING",
+    "WSTRING",
 ];
 
 /// What the standard has and the subset does not, with what to do instead.
@@ -138,7 +192,10 @@ impl Parser<'_> {
         match self.kind() {
             Kind::End => "the end of the text".to_owned(),
             _ => {
-                let text = self.source.get(span.start as usize..span.end as usize).unwrap_or_default();
+                let text = self
+                    .source
+                    .get(span.start as usize..span.end as usize)
+                    .unwrap_or_default();
                 format!("`{}`", text.chars().take(32).collect::<String>())
             }
         }
@@ -178,8 +235,10 @@ impl Parser<'_> {
         if !self.take_symbol(";") {
             let end = self.before().end;
             let found = self.found();
-            self.sink
-                .error(Span { start: end, end }, format!("`;` is expected here, before {found}"));
+            self.sink.error(
+                Span { start: end, end },
+                format!("`;` is expected here, before {found}"),
+            );
         }
     }
 
@@ -199,8 +258,10 @@ impl Parser<'_> {
     fn deeper<T>(&mut self, read: impl FnOnce(&mut Self) -> Parsed<T>) -> Parsed<T> {
         if self.depth >= DEPTH_MAX {
             let span = self.span();
-            self.sink
-                .error(span, format!("nested deeper than {DEPTH_MAX} levels: take parts out into functions"));
+            self.sink.error(
+                span,
+                format!("nested deeper than {DEPTH_MAX} levels: take parts out into functions"),
+            );
             return Err(Slip);
         }
         self.depth += 1;
@@ -234,7 +295,9 @@ impl Parser<'_> {
                     "VAR_GLOBAL" => self.block(BlockKind::Global).map(|block| file.globals.push(block)),
                     "PROGRAM" => self.pou(PouKind::Program, attributes).map(|pou| file.pous.push(pou)),
                     "FUNCTION" => self.pou(PouKind::Function, attributes).map(|pou| file.pous.push(pou)),
-                    "FUNCTION_BLOCK" => self.pou(PouKind::FunctionBlock, attributes).map(|pou| file.pous.push(pou)),
+                    "FUNCTION_BLOCK" => self
+                        .pou(PouKind::FunctionBlock, attributes)
+                        .map(|pou| file.pous.push(pou)),
                     _ => Err(self.expected("PROGRAM, FUNCTION_BLOCK, FUNCTION, TYPE or VAR_GLOBAL CONSTANT")),
                 },
                 Kind::End => Ok(()),
@@ -270,7 +333,17 @@ impl Parser<'_> {
             let tokens = tokens(self.source, inner, &mut quiet);
             let ours = matches!(
                 tokens.as_slice(),
-                [Token { kind: Kind::Ident(_), .. }, Token { kind: Kind::Symbol(":="), .. }, ..]
+                [
+                    Token {
+                        kind: Kind::Ident(_),
+                        ..
+                    },
+                    Token {
+                        kind: Kind::Symbol(":="),
+                        ..
+                    },
+                    ..
+                ]
             );
             if !ours {
                 continue;
@@ -310,209 +383,6 @@ impl Parser<'_> {
         };
         let span = key.span.to(self.before());
         Ok(Attribute { key, value, span })
-    }
-
-    fn types(&mut self, types: &mut Vec<TypeDeclaration>) -> Parsed<()> {
-        self.bump();
-        while !self.is_word("END_TYPE") {
-            if self.at_end() {
-                return Err(self.expected("END_TYPE"));
-            }
-            let read = (|| {
-                let name = self.name("the name of a type")?;
-                self.need_symbol(":")?;
-                let ty = self.type_ref()?;
-                let init = self.initial()?;
-                types.push(TypeDeclaration { name, ty, init });
-                Ok(())
-            })();
-            match read {
-                // Behind END_STRUCT many write none.
-                Ok(()) if matches!(types.last(), Some(t) if matches!(t.ty.kind, TypeKind::Struct(_))) => {
-                    self.take_symbol(";");
-                }
-                Ok(()) => self.semicolon(),
-                Err(Slip) => self.recover(&["END_TYPE", "PROGRAM", "FUNCTION", "FUNCTION_BLOCK", "VAR_GLOBAL"]),
-            }
-            if matches!(self.kind(), Kind::Ident(w) if ["PROGRAM", "FUNCTION", "FUNCTION_BLOCK", "VAR_GLOBAL"].contains(&w.as_str()))
-            {
-                return Err(self.expected("END_TYPE"));
-            }
-        }
-        self.bump();
-        Ok(())
-    }
-
-    fn type_ref(&mut self) -> Parsed<TypeRef> {
-        self.deeper(Self::type_here)
-    }
-
-    fn type_here(&mut self) -> Parsed<TypeRef> {
-        let start = self.span();
-        let kind = if self.take_word("ARRAY") {
-            self.need_symbol("[")?;
-            let mut ranges = Vec::new();
-            loop {
-                let low = self.expression()?;
-                self.need_symbol("..")?;
-                ranges.push((low, self.expression()?));
-                if !self.take_symbol(",") {
-                    break;
-                }
-            }
-            self.need_symbol("]")?;
-            self.need_word("OF")?;
-            TypeKind::Array(ranges, Box::new(self.type_ref()?))
-        } else if self.take_word("STRUCT") {
-            let mut fields = Vec::new();
-            while !self.is_word("END_STRUCT") {
-                if self.at_end() || matches!(self.kind(), Kind::Ident(w) if w == "END_TYPE" || w == "END_VAR") {
-                    return Err(self.expected("END_STRUCT"));
-                }
-                if self.declarations(&mut fields).is_err() {
-                    self.recover(&["END_STRUCT", "END_TYPE", "END_VAR"]);
-                }
-            }
-            self.bump();
-            TypeKind::Struct(fields)
-        } else if self.take_symbol("(") {
-            let mut values = Vec::new();
-            loop {
-                let name = self.name("the name of an enumerated value")?;
-                let value = if self.take_symbol(":=") { Some(self.expression()?) } else { None };
-                values.push((name, value));
-                if !self.take_symbol(",") {
-                    break;
-                }
-            }
-            self.need_symbol(")")?;
-            TypeKind::Enum(values)
-        } else {
-            let name = self.name("a type")?;
-            if self.is_symbol("(") {
-                let span = self.span();
-                self.sink
-                    .error(span, "subranges are outside the subset: use LIMIT where a value must stay in a range");
-                return Err(Slip);
-            }
-            TypeKind::Named(name)
-        };
-        Ok(TypeRef {
-            kind,
-            span: start.to(self.before()),
-        })
-    }
-
-    fn initial(&mut self) -> Parsed<Option<Init>> {
-        if self.take_symbol(":=") { self.init().map(Some) } else { Ok(None) }
-    }
-
-    fn init(&mut self) -> Parsed<Init> {
-        self.deeper(Self::init_here)
-    }
-
-    fn init_here(&mut self) -> Parsed<Init> {
-        let start = self.span();
-        let kind = if self.take_symbol("[") {
-            let mut items = Vec::new();
-            loop {
-                // `3(0)`: a count before what is repeated.
-                let repeats = matches!(self.kind(), Kind::Int(_)) && matches!(self.ahead(1), Kind::Symbol("("));
-                if repeats {
-                    let count = Expr {
-                        kind: match self.kind() {
-                            Kind::Int(n) => ExprKind::Int(*n),
-                            _ => ExprKind::Wrong,
-                        },
-                        span: self.span(),
-                        depth: 1,
-                    };
-                    self.bump();
-                    self.bump();
-                    items.push((Some(count), self.init()?));
-                    self.need_symbol(")")?;
-                } else {
-                    items.push((None, self.init()?));
-                }
-                if !self.take_symbol(",") {
-                    break;
-                }
-            }
-            self.need_symbol("]")?;
-            InitKind::Array(items)
-        } else if self.is_symbol("(")
-            && matches!(self.ahead(1), Kind::Ident(_))
-            && matches!(self.ahead(2), Kind::Symbol(":="))
-        {
-            self.bump();
-            let mut fields = Vec::new();
-            loop {
-                let name = self.name("the name of a field")?;
-                self.need_symbol(":=")?;
-                fields.push((name, self.init()?));
-                if !self.take_symbol(",") {
-                    break;
-                }
-            }
-            self.need_symbol(")")?;
-            InitKind::Struct(fields)
-        } else {
-            InitKind::Expr(self.expression()?)
-        };
-        Ok(Init {
-            kind,
-            span: start.to(self.before()),
-        })
-    }
-
-    /// `a, b : INT := 5;` with pragmas before it or before the semicolon.
-    fn declarations(&mut self, into: &mut Vec<Declaration>) -> Parsed<()> {
-        let mut attributes = self.pragmas();
-        let mut names = vec![self.name("the name of a variable")?];
-        while self.take_symbol(",") {
-            names.push(self.name("the name of a variable")?);
-        }
-        if self.is_word("AT") {
-            let span = self.span();
-            self.sink
-                .error(span, "AT is outside the subset: a loop's file connects ports to points");
-            return Err(Slip);
-        }
-        self.need_symbol(":")?;
-        let ty = self.type_ref()?;
-        let init = self.initial()?;
-        attributes.extend(self.pragmas());
-        self.semicolon();
-        // And behind it, on the same line.
-        while let Kind::Pragma(_) = self.kind() {
-            let between = self.source.get(self.before().end as usize..self.span().start as usize);
-            if between.is_none_or(|text| text.contains('\n')) {
-                break;
-            }
-            attributes.extend(self.pragmas_once());
-        }
-        for name in names {
-            into.push(Declaration {
-                name,
-                ty: ty.clone(),
-                init: init.clone(),
-                attributes: attributes.clone(),
-            });
-        }
-        Ok(())
-    }
-
-    /// The one pragma that stands here.
-    fn pragmas_once(&mut self) -> Vec<Attribute> {
-        let rest = self.tokens.split_off((self.at + 1).min(self.tokens.len()));
-        self.tokens.push(Token {
-            kind: Kind::End,
-            span: self.span(),
-        });
-        let attributes = self.pragmas();
-        self.tokens.pop();
-        self.tokens.extend(rest);
-        attributes
     }
 
     fn block(&mut self, kind: BlockKind) -> Parsed<Block> {
@@ -557,7 +427,11 @@ impl Parser<'_> {
             PouKind::Program => "END_PROGRAM",
         };
         let name = self.name("a name")?;
-        let result = if self.take_symbol(":") { Some(self.type_ref()?) } else { None };
+        let result = if self.take_symbol(":") {
+            Some(self.type_ref()?)
+        } else {
+            None
+        };
         attributes.extend(self.pragmas());
         self.take_symbol(";");
         let mut blocks = Vec::new();

@@ -49,11 +49,17 @@ pub(crate) const SCALARS: [(&str, Scalar); 17] = [
 
 impl Scalar {
     pub(crate) fn named(upper: &str) -> Option<Self> {
-        SCALARS.iter().find(|(name, _)| *name == upper).map(|(_, scalar)| *scalar)
+        SCALARS
+            .iter()
+            .find(|(name, _)| *name == upper)
+            .map(|(_, scalar)| *scalar)
     }
 
     pub(crate) fn name(self) -> &'static str {
-        SCALARS.iter().find(|(_, scalar)| *scalar == self).map_or("?", |(name, _)| name)
+        SCALARS
+            .iter()
+            .find(|(_, scalar)| *scalar == self)
+            .map_or("?", |(name, _)| name)
     }
 
     /// In memory, in bits.
@@ -241,7 +247,11 @@ impl Types {
             Ty::Struct(n) => self.structures.get(*n).map_or_else(String::new, fields),
             Ty::Block(n) => self.blocks.get(*n).map_or_else(String::new, fields),
             Ty::Array(array) => {
-                let ranges: Vec<String> = array.ranges.iter().map(|(low, count)| format!("{low}+{count}")).collect();
+                let ranges: Vec<String> = array
+                    .ranges
+                    .iter()
+                    .map(|(low, count)| format!("{low}+{count}"))
+                    .collect();
                 format!("[{}]{}", ranges.join(","), self.signature(&array.of))
             }
             Ty::Scalar(_) | Ty::Wrong => self.name(ty),

@@ -7,6 +7,7 @@ use std::{
 };
 
 use bumpless_tests::{Binary, Cell, CellOptions, pressure_loop};
+use serde_json::json;
 
 use crate::text;
 
@@ -53,29 +54,47 @@ fn a_law_in_structured_text_runs_a_loop_and_is_swapped_with_pid_without_a_bump()
     let api = cell.api().unwrap();
     api.upload_stock(&["pid"]).unwrap();
     let law = api.upload(&folder.path().join("law.wasm")).unwrap();
-    assert_eq!((text(&law["name"]), text(&law["admission"]["verdict"])), ("pressure-law".to_owned(), "passed".to_owned()));
-    api.apply(&pressure_loop("pressure-law", 50.0)).unwrap();
-    let name = text(&pressure_loop("pressure-law", 50.0)["name"]);
+    assert_eq!(
+        (text(&law["name"]), text(&law["admission"]["verdict"])),
+        ("pressure-law".to_owned(), "passed".to_owned())
+    );
+    let mut draft = pressure_loop("pressure-law", 50.0);
+    draft["parameters"] = json!({ "k": 4.0, "ti": 4.0 });
+    api.apply(&draft).unwrap();
+    let name = text(&draft["name"]);
     let runs = |what: &'static str, seq: u64| {
-        api.wait_for_loop(&name, what, |view| view["record"]["seq"].as_u64().unwrap_or(0) > seq).unwrap()
+        api.wait_for_loop(&name, what, |view| view["seq"].as_u64().unwrap_or(0) > seq)
+            .unwrap()
     };
     let seen = runs("the law to run", 20);
-    let mut seq = seen["record"]["seq"].as_u64().unwrap_or(0);
+    let mut seq = seen["seq"].as_u64().unwrap_or(0);
     for component in ["pid", "pressure-law", "pid"] {
         let end = api.swap(&name, component).unwrap();
         let bump = end["hand_over"]["bump_percent"].as_f64().unwrap();
         assert!(bump < 1.0, "{component}: {end}");
         let seen = runs("the swapped law to run", seq + 10);
-        seq = seen["record"]["seq"].as_u64().unwrap_or(0);
+        seq = seen["seq"].as_u64().unwrap_or(0);
     }
 
     // A save goes into the loop; the second one takes over the state of the first.
     let dev = ["dev", "law.st", "--loop", &name, "--builds", "1", "--api", api.base()];
     let first = bumpless(folder.path(), &dev);
-    assert!(first.status.success() && said(&first).contains("pressure-law@0.0.1 is in force"), "{}", said(&first));
-    fs::write(folder.path().join("law.st"), LAW.replace("VAR e : LREAL", "VAR e, unused : LREAL")).unwrap();
+    assert!(
+        first.status.success() && said(&first).contains("pressure-law@0.0.1 is in force"),
+        "{}",
+        said(&first)
+    );
+    fs::write(
+        folder.path().join("law.st"),
+        LAW.replace("VAR e : LREAL", "VAR e, unused : LREAL"),
+    )
+    .unwrap();
     let second = bumpless(folder.path(), &dev);
-    assert!(second.status.success() && said(&second).contains("pressure-law@0.0.2 is in force"), "{}", said(&second));
+    assert!(
+        second.status.success() && said(&second).contains("pressure-law@0.0.2 is in force"),
+        "{}",
+        said(&second)
+    );
     let view = api.loop_view(&name).unwrap();
     assert!(view.to_string().contains("0.0.2"), "{view}");
 }
@@ -91,7 +110,9 @@ fn a_project_is_checked_without_a_cell_and_told_where_it_is_wrong() {
         assert!(said(&checked).contains(part), "{part}: {}", said(&checked));
     }
     let text_file = folder.path().join("level/level.st");
-    let wrong = fs::read_to_string(&text_file).unwrap().replace("e := setpoint - pv;", "e := setpoint - pw;");
+    let wrong = fs::read_to_string(&text_file)
+        .unwrap()
+        .replace("e := setpoint - pv;", "e := setpoint - pw;");
     fs::write(&text_file, wrong).unwrap();
     let refused = bumpless(folder.path(), &["check", "level"]);
     assert_eq!(refused.status.code(), Some(1));

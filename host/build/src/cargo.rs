@@ -31,7 +31,12 @@ struct Artifact {
 
 fn run(program: &'static str, command: &mut Command) -> Result<Vec<u8>, Error> {
     // What an outer cargo put there would change the component and make cargo build everything anew.
-    for name in ["RUSTFLAGS", "CARGO_ENCODED_RUSTFLAGS", "RUSTC_WORKSPACE_WRAPPER", "CARGO_BUILD_TARGET"] {
+    for name in [
+        "RUSTFLAGS",
+        "CARGO_ENCODED_RUSTFLAGS",
+        "RUSTC_WORKSPACE_WRAPPER",
+        "CARGO_BUILD_TARGET",
+    ] {
         command.env_remove(name);
     }
     let output = command
@@ -51,8 +56,16 @@ fn run(program: &'static str, command: &mut Command) -> Result<Vec<u8>, Error> {
 pub(crate) fn build(folder: &Path, version: Option<&str>) -> Result<Built, Error> {
     let mut cargo = Command::new("cargo");
     cargo.current_dir(folder).args([
-        "build", "--quiet", "--release", "--lib", "--target", TARGET, "--message-format", "json-render-diagnostics",
-        "--config", STACK,
+        "build",
+        "--quiet",
+        "--release",
+        "--lib",
+        "--target",
+        TARGET,
+        "--message-format",
+        "json-render-diagnostics",
+        "--config",
+        STACK,
     ]);
     if let Some(version) = version {
         cargo.env(VERSION, version);
@@ -74,7 +87,9 @@ pub(crate) fn build(folder: &Path, version: Option<&str>) -> Result<Built, Error
         .map(|encoder| encoder.validate(true))
         .and_then(ComponentEncoder::encode)
         .map_err(|error| Error::Encode(format!("{error:#}")))?;
-    let name = module.file_name().map_or_else(|| "controller.wasm".into(), ToOwned::to_owned);
+    let name = module
+        .file_name()
+        .map_or_else(|| "controller.wasm".into(), ToOwned::to_owned);
     Ok(Built {
         component,
         output: folder.join(name),

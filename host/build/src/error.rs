@@ -55,7 +55,9 @@ pub enum Error {
         path: PathBuf,
     },
     /// The module does not become a component.
-    #[error("the module does not become a component: {0}; a controller uses bumpless-sdk and is built for wasm32-unknown-unknown")]
+    #[error(
+        "the module does not become a component: {0}; a controller uses bumpless-sdk and is built for wasm32-unknown-unknown"
+    )]
     Encode(String),
     /// A name that a component cannot have.
     #[error("{0:?} is no name of a project: use 1 to 32 lower-case letters, digits and single dashes, a letter first")]

@@ -103,9 +103,16 @@ mod tests {
         assert_eq!(built.output, project.join("level_loop.wasm"));
         assert_eq!(built, build(&project.join("level_loop.st"), None).unwrap());
         let other = build(&project, Some("7.8.9")).unwrap();
-        assert!(other.component.windows(5).any(|w| w == b"7.8.9") && !built.component.windows(5).any(|w| w == b"7.8.9"));
+        assert!(
+            other.component.windows(5).any(|w| w == b"7.8.9") && !built.component.windows(5).any(|w| w == b"7.8.9")
+        );
         let again = create(Language::St, folder.path(), "level-loop", None).unwrap_err();
-        assert!(again.to_string().ends_with("level-loop is there already: choose another name"), "{again}");
+        assert!(
+            again
+                .to_string()
+                .ends_with("level-loop is there already: choose another name"),
+            "{again}"
+        );
     }
 
     #[test]
@@ -118,8 +125,21 @@ mod tests {
         assert!(text(&file).contains("no source of a controller"));
         let bad = folder.path().join("a.st");
         fs::write(&bad, "PROGRAM p\nVAR_OUTPUT r : REAL; END_VAR\nr := x;\nEND_PROGRAM").unwrap();
-        assert!(text(folder.path()).ends_with("a.st:3:6: there is no variable X"), "{}", text(folder.path()));
-        for (name, good) in [("a", true), ("a-1", true), ("A", false), ("", false), ("1a", false), ("a_b", false), ("a--b", false), ("a-", false)] {
+        assert!(
+            text(folder.path()).ends_with("a.st:3:6: there is no variable X"),
+            "{}",
+            text(folder.path())
+        );
+        for (name, good) in [
+            ("a", true),
+            ("a-1", true),
+            ("A", false),
+            ("", false),
+            ("1a", false),
+            ("a_b", false),
+            ("a--b", false),
+            ("a-", false),
+        ] {
             assert_eq!(create(Language::St, folder.path(), name, None).is_ok(), good, "{name}");
         }
     }

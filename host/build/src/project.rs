@@ -36,7 +36,9 @@ const ST: [(&str, &str); 3] = [
 /// # Errors
 /// [`Error::Name`], [`Error::Exists`], [`Error::NoSdk`], or a file that cannot be written.
 pub fn create(language: Language, parent: &Path, name: &str, sdk: Option<&Path>) -> Result<PathBuf, Error> {
-    let letters = name.bytes().all(|b| b.is_ascii_lowercase() || b.is_ascii_digit() || b == b'-');
+    let letters = name
+        .bytes()
+        .all(|b| b.is_ascii_lowercase() || b.is_ascii_digit() || b == b'-');
     let first = name.bytes().next().is_some_and(|b| b.is_ascii_lowercase());
     if !letters || !first || name.len() > 32 || name.contains("--") || name.ends_with('-') {
         return Err(Error::Name(name.to_owned()));
@@ -77,5 +79,7 @@ pub fn sdk_near() -> Option<PathBuf> {
     let here = env::current_dir().ok();
     let program = env::current_exe().ok();
     let above = here.iter().chain(program.iter()).flat_map(|path| path.ancestors());
-    above.map(|folder| folder.join("guest-sdk")).find(|sdk| sdk.join("Cargo.toml").is_file())
+    above
+        .map(|folder| folder.join("guest-sdk"))
+        .find(|sdk| sdk.join("Cargo.toml").is_file())
 }

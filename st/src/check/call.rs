@@ -16,7 +16,10 @@ impl Checker<'_> {
         match self.function(callee, arguments, want, span) {
             Some((expr, outputs)) if outputs.is_empty() => expr,
             Some(_) => {
-                self.error(span, "outputs of a function are taken where it stands alone as a statement");
+                self.error(
+                    span,
+                    "outputs of a function are taken where it stands alone as a statement",
+                );
                 WRONG
             }
             None => WRONG,
@@ -32,13 +35,19 @@ impl Checker<'_> {
         span: Span,
     ) -> Option<(Expr, Vec<(Place, Expr)>)> {
         let ExprKind::Name(name) = &callee.kind else {
-            self.error(callee.span, "a call of a block stands alone as a statement; its outputs are fields");
+            self.error(
+                callee.span,
+                "a call of a block stands alone as a statement; its outputs are fields",
+            );
             return None;
         };
         // A function of the text or the library comes before the overloaded ones, of which none can have its name.
         let Some(&number) = self.pou_names.get(&name.upper) else {
             if self.scope.contains_key(&name.upper) {
-                self.error(callee.span, "a call of a block stands alone as a statement; its outputs are fields");
+                self.error(
+                    callee.span,
+                    "a call of a block stands alone as a statement; its outputs are fields",
+                );
                 return None;
             }
             return match self.standard(name, arguments, want, span) {
@@ -56,7 +65,10 @@ impl Checker<'_> {
         if kind != PouKind::Function {
             self.error(
                 name.span,
-                format!("{} is no function: declare an instance of it in VAR and call that", name.upper),
+                format!(
+                    "{} is no function: declare an instance of it in VAR and call that",
+                    name.upper
+                ),
             );
             return None;
         }
@@ -148,7 +160,10 @@ impl Checker<'_> {
                 let (want, have) = (self.types.name(&parameter.ty), self.types.name(&target.ty));
                 self.error(
                     argument.value.span,
-                    format!("{} is a VAR_IN_OUT of type {want}; a variable of just this type is needed, not {have}", parameter.name),
+                    format!(
+                        "{} is a VAR_IN_OUT of type {want}; a variable of just this type is needed, not {have}",
+                        parameter.name
+                    ),
                 );
                 return None;
             }
@@ -201,8 +216,17 @@ impl Checker<'_> {
         };
         self.calls.push(block);
         let name = self.types.name(&instance.ty);
-        let fields = self.types.blocks.get(block).map(|b| b.fields.clone()).unwrap_or_default();
-        let parameters = self.pous.get(block).map(|pou| pou.parameters.clone()).unwrap_or_default();
+        let fields = self
+            .types
+            .blocks
+            .get(block)
+            .map(|b| b.fields.clone())
+            .unwrap_or_default();
+        let parameters = self
+            .pous
+            .get(block)
+            .map(|pou| pou.parameters.clone())
+            .unwrap_or_default();
         let inputs_in_order: Vec<_> = fields.iter().filter(|field| field.access == Access::Free).collect();
         let (mut inputs, mut outputs) = (Vec::new(), Vec::new());
         let mut references: Vec<Option<Place>> = vec![None; parameters.len()];
@@ -210,12 +234,16 @@ impl Checker<'_> {
         for argument in arguments {
             if argument.output {
                 let formal = argument.name.as_ref()?;
-                let field = fields.iter().find(|f| f.name == formal.upper && f.access == Access::Read);
+                let field = fields
+                    .iter()
+                    .find(|f| f.name == formal.upper && f.access == Access::Read);
                 let Some(field) = field else {
                     self.error(formal.span, format!("{name} has no output {}", formal.upper));
                     continue;
                 };
-                let Some(target) = self.target(&argument.value) else { continue };
+                let Some(target) = self.target(&argument.value) else {
+                    continue;
+                };
                 let convert = match (field.ty.scalar(), target.ty.scalar()) {
                     _ if field.ty == target.ty => None,
                     (Some(from), Some(to)) if from.widens_to(to) => Some((from, to)),
@@ -255,7 +283,10 @@ impl Checker<'_> {
             let Some(field) = field else {
                 match &argument.name {
                     Some(formal) => self.error(formal.span, format!("{name} has no input {}", formal.upper)),
-                    None => self.error(argument.value.span, format!("{name} has {} inputs", inputs_in_order.len())),
+                    None => self.error(
+                        argument.value.span,
+                        format!("{name} has {} inputs", inputs_in_order.len()),
+                    ),
                 }
                 continue;
             };
@@ -276,7 +307,10 @@ impl Checker<'_> {
         for (parameter, slot) in parameters.iter().zip(references) {
             match slot {
                 Some(place) => all.push(place),
-                None => self.error(span, format!("{name} is called without its VAR_IN_OUT {}", parameter.name)),
+                None => self.error(
+                    span,
+                    format!("{name} is called without its VAR_IN_OUT {}", parameter.name),
+                ),
             }
         }
         Some(Stmt::Invoke {

@@ -81,14 +81,20 @@ impl Checker<'_> {
                 // Bits may be written as negative numbers nowhere, and as all of their pattern everywhere.
                 if n < low || n > high {
                     let name = scalar.name();
-                    self.error(span, format!("{n} does not fit into {name}, which holds {low} to {high}"));
+                    self.error(
+                        span,
+                        format!("{n} does not fit into {name}, which holds {low} to {high}"),
+                    );
                     return WRONG;
                 }
                 value(Value::Whole(n as i64), Ty::Scalar(scalar))
             }
             (Literal::Int(n), _) => {
                 let fits = |scalar: Scalar| (scalar.range().0..=scalar.range().1).contains(&n);
-                match [Scalar::Dint, Scalar::Lint, Scalar::Ulint].into_iter().find(|s| fits(*s)) {
+                match [Scalar::Dint, Scalar::Lint, Scalar::Ulint]
+                    .into_iter()
+                    .find(|s| fits(*s))
+                {
                     Some(scalar) => value(Value::Whole(n as i64), Ty::Scalar(scalar)),
                     None => {
                         self.error(span, format!("{n} does not fit into any type"));
@@ -137,7 +143,9 @@ impl Checker<'_> {
             }
             let (a, b) = (from.name(), into.name());
             let cure = match (from, into) {
-                (Scalar::Bool, _) | (_, Scalar::Bool) if from.is_real() || into.is_real() => "compare it with a number".to_owned(),
+                (Scalar::Bool, _) | (_, Scalar::Bool) if from.is_real() || into.is_real() => {
+                    "compare it with a number".to_owned()
+                }
                 _ => format!("write {a}_TO_{b}(…)"),
             };
             self.error(span, format!("{a} does not become {b} by itself: {cure}"));
@@ -167,7 +175,11 @@ impl Checker<'_> {
         if third.is_none() {
             self.error(
                 span,
-                format!("{what} cannot take {} and {} together: convert one of them", a.name(), b.name()),
+                format!(
+                    "{what} cannot take {} and {} together: convert one of them",
+                    a.name(),
+                    b.name()
+                ),
             );
         }
         third

@@ -30,12 +30,19 @@ impl<'a> Checker<'a> {
             return (Ty::Scalar(scalar), vec![0; scalar.bits() as usize / 8]);
         }
         if let Some(&number) = self.pou_names.get(&name.upper) {
-            if self.pous.get(number).is_some_and(|pou| pou.ast.kind == PouKind::FunctionBlock) {
+            if self
+                .pous
+                .get(number)
+                .is_some_and(|pou| pou.ast.kind == PouKind::FunctionBlock)
+            {
                 self.declare(number, Some(name.span));
                 let init = self.block_init(number);
                 return (Ty::Block(number), init);
             }
-            self.error(name.span, format!("{} is no type: only function blocks have instances", name.upper));
+            self.error(
+                name.span,
+                format!("{} is no type: only function blocks have instances", name.upper),
+            );
             return (Ty::Wrong, Vec::new());
         }
         match self.named.get_mut(&name.upper) {
@@ -107,7 +114,10 @@ impl<'a> Checker<'a> {
         let stride = self.types.size(&of);
         let size = elements.saturating_mul(u64::from(stride));
         if size > u64::from(VARIABLE_MAX) {
-            self.error(span, format!("this array has {size} bytes; a variable has at most {VARIABLE_MAX}"));
+            self.error(
+                span,
+                format!("this array has {size} bytes; a variable has at most {VARIABLE_MAX}"),
+            );
             return (Ty::Wrong, Vec::new());
         }
         let array = Array {
@@ -127,12 +137,18 @@ impl<'a> Checker<'a> {
         let mut bytes = Vec::new();
         for declaration in declarations {
             if made.fields.iter().any(|field| field.name == declaration.name.upper) {
-                self.error(declaration.name.span, format!("the field {} is declared twice", declaration.name.upper));
+                self.error(
+                    declaration.name.span,
+                    format!("the field {} is declared twice", declaration.name.upper),
+                );
                 continue;
             }
             let (ty, mut first) = self.type_of(&declaration.ty, None);
             if matches!(ty, Ty::Block(_)) {
-                self.error(declaration.ty.span, "a structure holds no function blocks; declare it beside the structure");
+                self.error(
+                    declaration.ty.span,
+                    "a structure holds no function blocks; declare it beside the structure",
+                );
                 continue;
             }
             if let Some(init) = &declaration.init {
@@ -150,7 +166,10 @@ impl<'a> Checker<'a> {
         if bytes.len() > VARIABLE_MAX as usize
             && let Some(first) = declarations.first()
         {
-            self.error(first.name.span, format!("this structure is larger than {VARIABLE_MAX} bytes"));
+            self.error(
+                first.name.span,
+                format!("this structure is larger than {VARIABLE_MAX} bytes"),
+            );
         }
         made.size = bytes.len() as u32;
         self.types.structures.push(made);
@@ -197,7 +216,10 @@ impl<'a> Checker<'a> {
                 if let Some((value, ty)) = self.constant(declaration) {
                     let symbol = Symbol::Constant(value, ty);
                     if self.globals.insert(declaration.name.upper.clone(), symbol).is_some() {
-                        self.error(declaration.name.span, format!("{} is declared twice", declaration.name.upper));
+                        self.error(
+                            declaration.name.span,
+                            format!("{} is declared twice", declaration.name.upper),
+                        );
                     }
                 }
             }
@@ -237,7 +259,13 @@ impl<'a> Checker<'a> {
         self.types
             .blocks
             .get(number)
-            .map(|block| block.fields.iter().flat_map(|field| field.init.iter().copied()).collect())
+            .map(|block| {
+                block
+                    .fields
+                    .iter()
+                    .flat_map(|field| field.init.iter().copied())
+                    .collect()
+            })
             .unwrap_or_default()
     }
 
@@ -306,7 +334,10 @@ impl<'a> Layout<'a> {
                 None
             }
             (None, true) => {
-                checker.error(name.span, format!("{} needs a type: FUNCTION {} : REAL", name.upper, name.upper));
+                checker.error(
+                    name.span,
+                    format!("{} needs a type: FUNCTION {} : REAL", name.upper, name.upper),
+                );
                 None
             }
             (None, false) => None,
@@ -317,7 +348,10 @@ impl<'a> Layout<'a> {
             }
         }
         if checker.frames.len() + self.frame.len() > FRAMES_MAX as usize {
-            checker.error(name.span, format!("all functions together need more than {FRAMES_MAX} bytes"));
+            checker.error(
+                name.span,
+                format!("all functions together need more than {FRAMES_MAX} bytes"),
+            );
             self.frame.clear();
         }
         // Only now: blocks that were laid out meanwhile have their frames before this one.
@@ -362,12 +396,7 @@ impl<'a> Layout<'a> {
         }
     }
 
-    fn variable(
-        &mut self,
-        checker: &mut Checker<'a>,
-        block: &ast::Block,
-        declaration: &ast::Declaration,
-    ) {
+    fn variable(&mut self, checker: &mut Checker<'a>, block: &ast::Block, declaration: &ast::Declaration) {
         let name = &declaration.name;
         let is_function = self.ast.kind == PouKind::Function;
         let is_program = self.ast.kind == PouKind::Program;
@@ -412,14 +441,25 @@ impl<'a> Layout<'a> {
             );
             return;
         }
-        let writable = if block.kind == BlockKind::Input { Writable::Input } else { Writable::Yes };
+        let writable = if block.kind == BlockKind::Input {
+            Writable::Input
+        } else {
+            Writable::Yes
+        };
         match block.kind {
             BlockKind::InOut if is_program => {
-                checker.error(name.span, "a PROGRAM has inputs and outputs; VAR_IN_OUT is for functions and blocks");
+                checker.error(
+                    name.span,
+                    "a PROGRAM has inputs and outputs; VAR_IN_OUT is for functions and blocks",
+                );
             }
             BlockKind::InOut => {
                 // Parameter 0 of a block's code is the instance.
-                let index = if is_function { self.parameters.len() as u32 } else { 1 + self.references };
+                let index = if is_function {
+                    self.parameters.len() as u32
+                } else {
+                    1 + self.references
+                };
                 self.references += 1;
                 self.parameters.push(Parameter {
                     name: name.upper.clone(),
@@ -492,7 +532,10 @@ impl<'a> Layout<'a> {
         match known(library).find(|(known, ..)| *known == name.upper) {
             Some((_, external, scalar)) => {
                 if ty != Ty::Scalar(*scalar) && ty != Ty::Wrong {
-                    checker.error(declaration.ty.span, format!("{} is of type {}", name.upper, scalar.name()));
+                    checker.error(
+                        declaration.ty.span,
+                        format!("{} is of type {}", name.upper, scalar.name()),
+                    );
                 }
                 self.put(checker, name, Symbol::External(*external, Ty::Scalar(*scalar)));
             }
@@ -523,10 +566,12 @@ impl Checker<'_> {
             _ if checked.ty == Ty::Wrong => None,
             Kind::Value(value) => Some(value),
             _ => {
-                self.error(expr.span, "this must be known while compiling: use literals and constants");
+                self.error(
+                    expr.span,
+                    "this must be known while compiling: use literals and constants",
+                );
                 None
             }
         }
     }
-
 }

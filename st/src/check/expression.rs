@@ -46,7 +46,10 @@ impl Checker<'_> {
                 let operand = self.expression(inner, want);
                 match operand.ty.scalar() {
                     Some(scalar) if scalar.is_number() && scalar.range().0 == 0 && scalar.is_int() => {
-                        self.error(expr.span, format!("{} has no negative values: convert it first", scalar.name()));
+                        self.error(
+                            expr.span,
+                            format!("{} has no negative values: convert it first", scalar.name()),
+                        );
                         WRONG
                     }
                     Some(scalar) if scalar.is_number() || scalar == Scalar::Time => {
@@ -116,7 +119,10 @@ impl Checker<'_> {
             }
             (Ty::Wrong, _) => WRONG,
             _ => {
-                self.error(name.span, format!("{} is neither elementary nor an enumeration", name.upper));
+                self.error(
+                    name.span,
+                    format!("{} is neither elementary nor an enumeration", name.upper),
+                );
                 WRONG
             }
         }
@@ -190,7 +196,10 @@ impl Checker<'_> {
                     None
                 }
                 Some(Symbol::External(..)) => {
-                    self.error(name.span, format!("{} comes from the host, and can only be read", name.upper));
+                    self.error(
+                        name.span,
+                        format!("{} comes from the host, and can only be read", name.upper),
+                    );
                     None
                 }
                 None => {
@@ -208,7 +217,10 @@ impl Checker<'_> {
                 let of = self.types.name(&place.ty);
                 match found {
                     Some((_, _, Access::None)) => {
-                        self.error(name.span, format!("{} is a variable inside of {of}: make it a VAR_OUTPUT", name.upper));
+                        self.error(
+                            name.span,
+                            format!("{} is a variable inside of {of}: make it a VAR_OUTPUT", name.upper),
+                        );
                         None
                     }
                     Some((offset, ty, access)) => {

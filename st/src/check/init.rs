@@ -50,7 +50,10 @@ impl Checker<'_> {
                         None => 1,
                     };
                     if at.saturating_add(count) > total {
-                        self.error(item.span, format!("more values than the {total} elements of this array"));
+                        self.error(
+                            item.span,
+                            format!("more values than the {total} elements of this array"),
+                        );
                         return;
                     }
                     let mut one = bytes.get(at * stride..(at + 1) * stride).unwrap_or_default().to_vec();
@@ -82,11 +85,17 @@ impl Checker<'_> {
             }
             (InitKind::Array(_), _) => {
                 let name = self.types.name(ty);
-                self.error(init.span, format!("a list of values is for arrays; this is of type {name}"));
+                self.error(
+                    init.span,
+                    format!("a list of values is for arrays; this is of type {name}"),
+                );
             }
             (InitKind::Struct(_), _) => {
                 let name = self.types.name(ty);
-                self.error(init.span, format!("fields are for structures and blocks; this is of type {name}"));
+                self.error(
+                    init.span,
+                    format!("fields are for structures and blocks; this is of type {name}"),
+                );
             }
         }
     }

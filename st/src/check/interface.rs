@@ -120,7 +120,10 @@ impl<'e> Attributes<'e> {
     fn finish(self, checker: &mut Checker<'_>, known: &str) {
         for attribute in self.0 {
             let key = attribute.key.upper.to_lowercase();
-            checker.error(attribute.key.span, format!("there is no attribute {key} here; there are {known}"));
+            checker.error(
+                attribute.key.span,
+                format!("there is no attribute {key} here; there are {known}"),
+            );
         }
     }
 }
@@ -130,7 +133,10 @@ impl Checker<'_> {
     fn short_name(&mut self, name: &ast::Name) -> String {
         let short = name.upper.to_lowercase().replace('_', "-");
         if short.len() > NAME_MAX {
-            self.error(name.span, format!("names of programs, ports and parameters have at most {NAME_MAX} characters"));
+            self.error(
+                name.span,
+                format!("names of programs, ports and parameters have at most {NAME_MAX} characters"),
+            );
         }
         short
     }
@@ -150,17 +156,35 @@ impl Checker<'_> {
         let seconds = if scalar == Scalar::Time { 1e-9 } else { 1.0 };
         let default = number(scalar, super::init::value_of(scalar, &first)) * seconds;
         let mut attributes = Attributes::new(&declaration.attributes);
-        let (mut low, mut high) = (attributes.number(self, "LOW", &ty), attributes.number(self, "HIGH", &ty));
+        let (mut low, mut high) = (
+            attributes.number(self, "LOW", &ty),
+            attributes.number(self, "HIGH", &ty),
+        );
         let unit = attributes.text(self, "UNIT").map(|(text, _)| text);
         let text = attributes.text(self, "TEXT").map(|(text, _)| text).unwrap_or_default();
         attributes.finish(self, "unit, low, high, text");
         let mut choices = Vec::new();
         if let Ty::Enum(number) = ty {
-            let values = self.types.enumerations.get(number).map(|e| e.values.clone()).unwrap_or_default();
-            if values.iter().enumerate().any(|(n, (_, value))| i32::try_from(n) != Ok(*value)) {
-                self.error(declaration.ty.span, "an enumeration that is a parameter counts 0, 1, 2, …");
+            let values = self
+                .types
+                .enumerations
+                .get(number)
+                .map(|e| e.values.clone())
+                .unwrap_or_default();
+            if values
+                .iter()
+                .enumerate()
+                .any(|(n, (_, value))| i32::try_from(n) != Ok(*value))
+            {
+                self.error(
+                    declaration.ty.span,
+                    "an enumeration that is a parameter counts 0, 1, 2, …",
+                );
             }
-            choices = values.iter().map(|(name, _)| name.to_lowercase().replace('_', "-")).collect();
+            choices = values
+                .iter()
+                .map(|(name, _)| name.to_lowercase().replace('_', "-"))
+                .collect();
             (low, high) = (Some(0.0), Some(values.len().saturating_sub(1) as f64));
         } else if scalar == Scalar::Bool {
             choices = vec!["false".to_owned(), "true".to_owned()];
@@ -174,7 +198,10 @@ impl Checker<'_> {
             return None;
         };
         if !(minimum <= default && default <= maximum) {
-            self.error(declaration.name.span, format!("{default} lies outside of {minimum} to {maximum}"));
+            self.error(
+                declaration.name.span,
+                format!("{default} lies outside of {minimum} to {maximum}"),
+            );
         }
         let name = self.short_name(&declaration.name);
         if self.tunables.len() >= PARAMETERS_MAX {
@@ -220,7 +247,13 @@ impl Checker<'_> {
                 continue;
             }
             for declaration in &block.declarations {
-                self.port(program, block.kind == BlockKind::Output, declaration, &mut made, &mut qualities);
+                self.port(
+                    program,
+                    block.kind == BlockKind::Output,
+                    declaration,
+                    &mut made,
+                    &mut qualities,
+                );
             }
         }
         for (of, offset, span) in qualities {
@@ -230,7 +263,10 @@ impl Checker<'_> {
             }
         }
         if self.sink.is_empty() && !made.ports.iter().any(|port| port.output) {
-            self.error(ast.name.span, "a controller moves something: declare at least one VAR_OUTPUT");
+            self.error(
+                ast.name.span,
+                "a controller moves something: declare at least one VAR_OUTPUT",
+            );
         }
         if made.ports.len() > PORTS_MAX {
             self.error(ast.name.span, format!("more than {PORTS_MAX} ports"));
@@ -260,7 +296,10 @@ impl Checker<'_> {
             return;
         };
         if !(scalar.is_number() || scalar == Scalar::Bool) {
-            self.error(declaration.ty.span, format!("a port carries BOOL or a number, not {}", scalar.name()));
+            self.error(
+                declaration.ty.span,
+                format!("a port carries BOOL or a number, not {}", scalar.name()),
+            );
             return;
         }
         let mut attributes = Attributes::new(&declaration.attributes);
@@ -274,7 +313,10 @@ impl Checker<'_> {
         }
         let unit = attributes.text(self, "UNIT").map(|(text, _)| text).unwrap_or_default();
         let mut text = attributes.text(self, "TEXT").map(|(text, _)| text).unwrap_or_default();
-        let range = match (attributes.number(self, "LOW", &ty), attributes.number(self, "HIGH", &ty)) {
+        let range = match (
+            attributes.number(self, "LOW", &ty),
+            attributes.number(self, "HIGH", &ty),
+        ) {
             (Some(low), Some(high)) if low <= high => Some((low, high)),
             (None, None) => None,
             (Some(low), Some(high)) => {
@@ -287,10 +329,21 @@ impl Checker<'_> {
             }
         };
         let required = attributes.flag(self, "REQUIRED").unwrap_or(true);
-        attributes.finish(self, if output { "unit, low, high, required, text" } else { "unit, low, high, required, quality, text" });
+        attributes.finish(
+            self,
+            if output {
+                "unit, low, high, required, text"
+            } else {
+                "unit, low, high, required, quality, text"
+            },
+        );
         if let Some((low, high)) = range {
             let range = format!("{low} to {high} {unit}");
-            text = if text.is_empty() { range } else { format!("{text}, {range}") };
+            text = if text.is_empty() {
+                range
+            } else {
+                format!("{text}, {range}")
+            };
             text = text.trim_end().chars().take(TEXT_MAX).collect();
         }
         let name = self.short_name(name);
@@ -310,7 +363,10 @@ impl Checker<'_> {
 
 fn is_version(text: &str) -> bool {
     let parts: Vec<&str> = text.split('.').collect();
-    parts.len() == 3 && parts.iter().all(|part| !part.is_empty() && part.len() < 10 && part.bytes().all(|b| b.is_ascii_digit()))
+    parts.len() == 3
+        && parts
+            .iter()
+            .all(|part| !part.is_empty() && part.len() < 10 && part.bytes().all(|b| b.is_ascii_digit()))
 }
 
 /// A value as a number.

@@ -128,7 +128,11 @@ impl Checker<'_> {
             }
             ("SQRT", [x]) => {
                 let (operand, scalar) = self.real_operand(x, want);
-                if operand.ty == Ty::Wrong { WRONG } else { Self::one(One::Sqrt, scalar, operand) }
+                if operand.ty == Ty::Wrong {
+                    WRONG
+                } else {
+                    Self::one(One::Sqrt, scalar, operand)
+                }
             }
             ("ATAN2", [y, x]) => self.real("__ATAN2", &[y, x], want, span),
             ("MOVE", [x]) => self.expression(x, want),
@@ -181,7 +185,11 @@ impl Checker<'_> {
                     _ => (One::Nearest, Scalar::Lreal),
                 };
                 let x = self.expression_as(x, &Ty::Scalar(from));
-                if x.ty == Ty::Wrong { WRONG } else { Self::one(op, from, x) }
+                if x.ty == Ty::Wrong {
+                    WRONG
+                } else {
+                    Self::one(op, from, x)
+                }
             }
             _ if upper.starts_with("__") => return None,
             _ => {
@@ -203,7 +211,10 @@ impl Checker<'_> {
 
     /// The arguments by place, where they may have been given by name.
     fn ordered<'e>(&mut self, name: &ast::Name, arguments: &'e [Argument]) -> Option<Vec<&'e ast::Expr>> {
-        let formals = FORMALS.iter().find(|(function, _)| *function == name.upper).map(|(_, formals)| *formals);
+        let formals = FORMALS
+            .iter()
+            .find(|(function, _)| *function == name.upper)
+            .map(|(_, formals)| *formals);
         let named = arguments.iter().filter(|argument| argument.name.is_some()).count();
         if named == 0 {
             return Some(arguments.iter().map(|argument| &argument.value).collect());
@@ -236,14 +247,20 @@ impl Checker<'_> {
 
     /// A real operand and its type; whole numbers become LREAL.
     fn real_operand(&mut self, x: &ast::Expr, want: Option<&Ty>) -> (Expr, Scalar) {
-        let wanted = want.and_then(Ty::scalar).filter(|s| s.is_real()).unwrap_or(Scalar::Lreal);
+        let wanted = want
+            .and_then(Ty::scalar)
+            .filter(|s| s.is_real())
+            .unwrap_or(Scalar::Lreal);
         let checked = self.expression(x, Some(&Ty::Scalar(wanted)));
         match checked.ty {
             Ty::Scalar(scalar) if scalar.is_real() => (checked, scalar),
             Ty::Scalar(scalar) if scalar.widens_to(Scalar::Lreal) => {
                 (Self::converted(checked, scalar, Scalar::Lreal), Scalar::Lreal)
             }
-            _ => (self.not_for("this function", "REAL or LREAL", &checked, x.span), Scalar::Lreal),
+            _ => (
+                self.not_for("this function", "REAL or LREAL", &checked, x.span),
+                Scalar::Lreal,
+            ),
         }
     }
 
@@ -285,7 +302,11 @@ impl Checker<'_> {
                 return self.not_for("a power", "numbers of at most 32 bits, REAL or LREAL", operand, span);
             }
         }
-        let answer = if from == Scalar::Real { Scalar::Real } else { Scalar::Lreal };
+        let answer = if from == Scalar::Real {
+            Scalar::Real
+        } else {
+            Scalar::Lreal
+        };
         let Some(&number) = self.pou_names.get("__EXPT") else {
             self.error(span, "the library has no __EXPT");
             return WRONG;
@@ -305,7 +326,9 @@ impl Checker<'_> {
 
     /// `ADD(a, b, c)` is `a + b + c`.
     fn chain(&mut self, op: Binary, given: &[&ast::Expr], want: Option<&Ty>, span: Span) -> Expr {
-        let Some((first, rest)) = given.split_first() else { return WRONG };
+        let Some((first, rest)) = given.split_first() else {
+            return WRONG;
+        };
         let mut whole = (*first).clone();
         for next in rest {
             whole = ast::Expr {
@@ -366,13 +389,7 @@ impl Checker<'_> {
     }
 
     /// The last of `cases` whose condition holds, else `otherwise`.
-    fn choose(
-        &mut self,
-        cases: Vec<(Expr, &ast::Expr)>,
-        otherwise: &ast::Expr,
-        want: Option<&Ty>,
-        span: Span,
-    ) -> Expr {
+    fn choose(&mut self, cases: Vec<(Expr, &ast::Expr)>, otherwise: &ast::Expr, want: Option<&Ty>, span: Span) -> Expr {
         let plain = self.expression(otherwise, want);
         if let Ty::Enum(_) = plain.ty {
             let ty = plain.ty.clone();
@@ -405,7 +422,9 @@ impl Checker<'_> {
         let Some(scalar) = checked.ty.scalar().filter(|s| s.is_int()) else {
             return self.not_for("MUX", "an integer first", &checked, index.span);
         };
-        let Some((first, rest)) = inputs.split_first() else { return WRONG };
+        let Some((first, rest)) = inputs.split_first() else {
+            return WRONG;
+        };
         let mut cases = Vec::new();
         for (n, input) in rest.iter().enumerate() {
             let at = Self::converted(checked.clone(), scalar, Scalar::Lint);
@@ -434,7 +453,11 @@ impl Checker<'_> {
         let by = Self::converted(by, count, Scalar::Lint);
         let low = value(Value::Whole(0), Ty::Scalar(Scalar::Lint));
         let high = value(
-            Value::Whole(if matches!(op, Op::Shl | Op::Shr) { i64::from(scalar.bits()) } else { i64::MAX }),
+            Value::Whole(if matches!(op, Op::Shl | Op::Shr) {
+                i64::from(scalar.bits())
+            } else {
+                i64::MAX
+            }),
             Ty::Scalar(Scalar::Lint),
         );
         let by = self.two(Op::Max, Scalar::Lint, by, low, span);

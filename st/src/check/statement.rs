@@ -9,7 +9,10 @@ use crate::{
 
 impl Checker<'_> {
     pub(super) fn statements(&mut self, statements: &[ast::Stmt]) -> Vec<Stmt> {
-        statements.iter().filter_map(|statement| self.statement(statement)).collect()
+        statements
+            .iter()
+            .filter_map(|statement| self.statement(statement))
+            .collect()
     }
 
     fn condition(&mut self, expr: &ast::Expr) -> Expr {
@@ -51,8 +54,15 @@ impl Checker<'_> {
                 Some(Stmt::Repeat(body, self.condition(until)))
             }
             StmtKind::Exit | StmtKind::Continue if self.loops == 0 => {
-                let word = if matches!(statement.kind, StmtKind::Exit) { "EXIT" } else { "CONTINUE" };
-                self.error(statement.span, format!("{word} stands within FOR, WHILE or REPEAT only"));
+                let word = if matches!(statement.kind, StmtKind::Exit) {
+                    "EXIT"
+                } else {
+                    "CONTINUE"
+                };
+                self.error(
+                    statement.span,
+                    format!("{word} stands within FOR, WHILE or REPEAT only"),
+                );
                 None
             }
             StmtKind::Exit => Some(Stmt::Exit),
@@ -80,7 +90,10 @@ impl Checker<'_> {
             return (value.ty != Ty::Wrong).then_some(Stmt::Assign(place, value));
         }
         if matches!(place.ty, Ty::Block(_)) {
-            self.error(target.span, "an instance of a block cannot be assigned; assign its inputs");
+            self.error(
+                target.span,
+                "an instance of a block cannot be assigned; assign its inputs",
+            );
             return None;
         }
         let (from, _) = self.place(value)?;
@@ -165,7 +178,10 @@ impl Checker<'_> {
         let scalar = match (scalar, &place) {
             (Some(scalar), _) if scalar.is_int() && scalar != Scalar::Ulint => scalar,
             (_, Some(_)) => {
-                self.error(variable.span, "FOR counts with SINT, INT, DINT, LINT, USINT, UINT or UDINT");
+                self.error(
+                    variable.span,
+                    "FOR counts with SINT, INT, DINT, LINT, USINT, UINT or UDINT",
+                );
                 Scalar::Dint
             }
             (_, None) => Scalar::Dint,

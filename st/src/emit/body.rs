@@ -41,7 +41,10 @@ pub(super) fn code(plan: &Plan<'_>, number: usize) -> Code {
             _ => ValType::I32,
         })
         .collect();
-    let answer = pou.result.as_ref().and_then(|(ty, offset)| Some((ty.scalar()?, *offset)));
+    let answer = pou
+        .result
+        .as_ref()
+        .and_then(|(ty, offset)| Some((ty.scalar()?, *offset)));
     let code = if function {
         let results: Vec<ValType> = answer.iter().map(|(scalar, _)| val_type(*scalar)).collect();
         Code::new(&parameters, &results)
@@ -352,7 +355,8 @@ impl Writer<'_, '_> {
                     self.code.all([I::LocalGet(chosen), I::I64Const(*low), I::I64Eq]);
                 } else {
                     self.code.all([I::LocalGet(chosen), I::I64Const(*low), I::I64GeS]);
-                    self.code.all([I::LocalGet(chosen), I::I64Const(*high), I::I64LeS, I::I32And]);
+                    self.code
+                        .all([I::LocalGet(chosen), I::I64Const(*high), I::I64LeS, I::I32And]);
                 }
                 self.code.push(I::I32Or);
             }
@@ -397,7 +401,8 @@ impl Writer<'_, '_> {
         self.code.all([I::I64Const(0), I::LocalGet(step), I::I64Sub, I::I64LtU]);
         self.code.all([I::LocalGet(step), I::I64Const(0), I::I64GtS, I::Select]);
         self.code.branch_if(exit);
-        self.code.all([I::LocalGet(count), I::LocalGet(step), I::I64Add, I::LocalSet(count)]);
+        self.code
+            .all([I::LocalGet(count), I::LocalGet(step), I::I64Add, I::LocalSet(count)]);
         self.code.branch(top);
         self.code.end();
         self.code.end();

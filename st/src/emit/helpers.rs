@@ -37,7 +37,9 @@ impl Helpers {
     pub(super) fn add(functions: &mut Functions, heap: u32) -> Self {
         let alloc = functions.add("allocate", allocate());
         functions.export("cabi_realloc", "cabi_realloc", reallocate(alloc));
-        for (name, export) in ["start", "step", "migrate"].map(|name| (name, format!("cabi_post_bumpless:control/control@0.1.0#{name}"))) {
+        for (name, export) in
+            ["start", "step", "migrate"].map(|name| (name, format!("cabi_post_bumpless:control/control@0.1.0#{name}")))
+        {
             let mut code = Code::new(&[I32], &[]);
             code.int(heap);
             code.set_global(Global::Heap);
@@ -71,14 +73,28 @@ fn allocate() -> Code {
     let from = code.local(I32);
     let end = code.local(I32);
     code.global(Global::Heap);
-    code.all([I::LocalTee(from), I::LocalGet(0), I::I32Add, I::I32Const(15), I::I32Add, I::I32Const(-16), I::I32And]);
+    code.all([
+        I::LocalTee(from),
+        I::LocalGet(0),
+        I::I32Add,
+        I::I32Const(15),
+        I::I32Add,
+        I::I32Const(-16),
+        I::I32And,
+    ]);
     code.set(end);
     // Around the end of all addresses.
     code.all([I::LocalGet(end), I::LocalGet(from), I::I32LtU]);
     code.when();
     code.push(I::Unreachable);
     code.end();
-    code.all([I::MemorySize(0), I::I32Const(16), I::I32Shl, I::LocalGet(end), I::I32LtU]);
+    code.all([
+        I::MemorySize(0),
+        I::I32Const(16),
+        I::I32Shl,
+        I::LocalGet(end),
+        I::I32LtU,
+    ]);
     code.when();
     code.all([
         I::LocalGet(end),
@@ -108,7 +124,14 @@ fn reallocate(alloc: u32) -> Code {
     let made = code.local(I32);
     code.all([I::LocalGet(3), I::Call(alloc), I::LocalSet(made)]);
     code.all([I::LocalGet(made), I::LocalGet(0)]);
-    code.all([I::LocalGet(1), I::LocalGet(3), I::LocalGet(1), I::LocalGet(3), I::I32LtU, I::Select]);
+    code.all([
+        I::LocalGet(1),
+        I::LocalGet(3),
+        I::LocalGet(1),
+        I::LocalGet(3),
+        I::I32LtU,
+        I::Select,
+    ]);
     code.copy();
     code.get(made);
     code
@@ -147,11 +170,19 @@ struct Divide {
 
 impl Divide {
     const fn signed(ty: ValType, operation: I<'static>) -> Self {
-        Self { ty, operation, wraps: true }
+        Self {
+            ty,
+            operation,
+            wraps: true,
+        }
     }
 
     const fn unsigned(ty: ValType, operation: I<'static>) -> Self {
-        Self { ty, operation, wraps: false }
+        Self {
+            ty,
+            operation,
+            wraps: false,
+        }
     }
 }
 

@@ -75,7 +75,11 @@ impl Code {
                     self.push(I::I32WrapI64);
                     self.narrow(to);
                 }
-                (false, true) => self.push(if from.signed() { I::I64ExtendI32S } else { I::I64ExtendI32U }),
+                (false, true) => self.push(if from.signed() {
+                    I::I64ExtendI32S
+                } else {
+                    I::I64ExtendI32U
+                }),
                 (false, false) => self.narrow(to),
                 (true, true) => {}
             },
@@ -211,7 +215,13 @@ impl Code {
             }
             Op::Min | Op::Max => {
                 let (a, b) = (self.local(ValType::I64), self.local(ValType::I64));
-                self.all([I::LocalSet(b), I::LocalTee(a), I::LocalGet(b), I::LocalGet(a), I::LocalGet(b)]);
+                self.all([
+                    I::LocalSet(b),
+                    I::LocalTee(a),
+                    I::LocalGet(b),
+                    I::LocalGet(a),
+                    I::LocalGet(b),
+                ]);
                 let below = if signed { I::I64LtS } else { I::I64LtU };
                 let above = if signed { I::I64GeS } else { I::I64GeU };
                 self.push(if op == Op::Min { below } else { above });
@@ -255,7 +265,13 @@ impl Code {
             }
             Op::Min | Op::Max => {
                 let (a, b) = (self.local(ValType::I32), self.local(ValType::I32));
-                self.all([I::LocalSet(b), I::LocalTee(a), I::LocalGet(b), I::LocalGet(a), I::LocalGet(b)]);
+                self.all([
+                    I::LocalSet(b),
+                    I::LocalTee(a),
+                    I::LocalGet(b),
+                    I::LocalGet(a),
+                    I::LocalGet(b),
+                ]);
                 let below = if signed { I::I32LtS } else { I::I32LtU };
                 let above = if signed { I::I32GeS } else { I::I32GeU };
                 self.push(if op == Op::Min { below } else { above });
@@ -271,8 +287,11 @@ impl Code {
             Op::Ror if bits == 32 => self.push(I::I32Rotr),
             Op::Rol | Op::Ror => {
                 let (a, by) = (self.local(ValType::I32), self.local(ValType::I32));
-                let (toward, back) =
-                    if op == Op::Rol { (I::I32Shl, I::I32ShrU) } else { (I::I32ShrU, I::I32Shl) };
+                let (toward, back) = if op == Op::Rol {
+                    (I::I32Shl, I::I32ShrU)
+                } else {
+                    (I::I32ShrU, I::I32Shl)
+                };
                 self.all([I::LocalSet(by), I::LocalTee(a), I::LocalGet(by)]);
                 self.push(toward);
                 self.all([I::LocalGet(a), I::I32Const(bits), I::LocalGet(by), I::I32Sub]);

@@ -1,193 +1,18 @@
-//! The functions of the world: `describe`, `start`, `step`, `migrate`; and the form of the state.
+//! The functions of the world: `describe`, `start`, `step`, `migrate`, and the constant data that they use.
 //!
-//! ```text
-//!   offset      size  what
-//!   0           1     mark of components' states: 0xB1
-//!   1           1     n, length of the name
-//!   2           n     the name
-//!   2+n         4     version of the layout
-//!   6+n         1     m, number of parameters
-//!   7+n         8·m   their values
-//!   7+n+8m      4     mark of this compiler's states: "BST1"
-//!   …           4     number of entries
-//!   …           8     per variable: 48 bits of a hash of its path and type, 16 bits of its length in bytes
-//!   …                 the variables, packed, in the order of the entries
-//! ```
-//! The front is that of the SDK's components. The entries make a state tell of itself what another version needs: `migrate` takes
-//! over every variable whose path and type it has too. Never: trusts a length that it did not write itself.
+//! Never: trusts a length that it did not write itself.
 
 use wasm_encoder::{Instruction as I, ValType};
 
-use super::{Code, Data, Functions, Global, Plan, READ, READING_AT, WRITE, at, pair};
-use crate::{
-    ast::Retain,
-    check::Checked,
-    error::Error,
-    types::{Scalar, Ty, Types},
+use super::{
+    Code, Data, Functions, Global, Plan, READ, READING_AT, WRITE, at, pair,
+    state::{CHANGED, FIRST, FLAG_AT, HIDDEN, Layout, MARK, OWN_MARK},
 };
-
-/// What begins every state of the SDK's form.
-const MARK: u8 = 0xB1;
-/// What begins the part that this compiler writes.
-const OWN_MARK: u32 = u32::from_le_bytes(*b"BST1");
-/// Greatest state, in bytes, as the host has it.
-const STATE_MAX: usize = 64 * 1024;
-/// Of the variables: a clock for timers, then one byte that tells what the next step is.
-const HIDDEN: u32 = 9;
-const FLAG_AT: u32 = 8;
+use crate::{check::Checked, types::Scalar};
 
 const I32: ValType = ValType::I32;
 const I64: ValType = ValType::I64;
 const F64: ValType = ValType::F64;
-
-/// How far a variable lives on.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-#[repr(u32)]
-enum Life {
-    /// It begins anew.
-    Never,
-    /// In a program of the same name.
-    SameName,
-    /// In any program.
-    Always,
-}
-
-/// One variable in the state.
-#[derive(Debug)]
-struct Entry {
-    word: u64,
-    offset: u32,
-    life: Life,
-}
-
-/// The form of a program's state.
-#[derive(Debug)]
-pub(crate) struct Layout {
-    /// A number of the entries.
-    pub(crate) version: u32,
-    /// The first state.
-    template: Vec<u8>,
-    entries: Vec<Entry>,
-    /// Where the parameters' values lie.
-    parameters: u32,
-    /// Where the variables lie.
-    variables: u32,
-    name: u32,
-}
-
-fn fnv(text: &str) -> u64 {
-    text.bytes().fold(0xcbf2_9ce4_8422_2325, |hash, byte| {
-        (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3)
-    })
-}
-
-struct Leaves<'a> {
-    types: &'a Types,
-    checked: &'a Checked<'a>,
-    entries: Vec<Entry>,
-}
-
-impl Leaves<'_> {
-    fn leaf(&mut self, path: &str, ty: &Ty, offset: u32, life: Life) {
-        let text = format!("{path}:{}", self.types.signature(ty));
-        let size = self.types.size(ty);
-        self.entries.push(Entry {
-            word: (fnv(&text) & !0xffff) | u64::from(size & 0xffff),
-            offset,
-            life,
-        });
-    }
-
-    fn walk(&mut self, path: &str, ty: &Ty, offset: u32, life: Life) {
-        let Some(structure) = self.types.structure(ty) else {
-            return self.leaf(path, ty, offset, life);
-        };
-        let retains = match ty {
-            Ty::Block(number) => self.checked.pous.get(*number).map(|pou| pou.retains.as_slice()),
-            _ => None,
-        };
-        for (n, field) in structure.fields.iter().enumerate() {
-            let own = match retains.and_then(|retains| retains.get(n)) {
-                _ if life == Life::Never => Life::Never,
-                Some(Retain::Retain) => Life::Always,
-                Some(Retain::NonRetain) => Life::Never,
-                _ => life,
-            };
-            self.walk(&format!("{path}.{}", field.name), &field.ty, offset + field.offset, own);
-        }
-    }
-}
-
-impl Layout {
-    /// Lays the state of a program out.
-    ///
-    /// # Errors
-    /// [`Error::State`] where it is too large for a record.
-    pub(super) fn of(checked: &Checked<'_>) -> Result<Self, Error> {
-        let interface = &checked.interface;
-        let mut leaves = Leaves {
-            types: &checked.types,
-            checked,
-            entries: Vec::new(),
-        };
-        leaves.leaf("#CLOCK", &Ty::Scalar(Scalar::Time), 0, Life::Always);
-        leaves.leaf("#FLAG", &Ty::Scalar(Scalar::Byte), FLAG_AT, Life::Never);
-        leaves.walk("", &Ty::Block(checked.program), HIDDEN, Life::SameName);
-        let entries = leaves.entries;
-        let mut all = String::new();
-        for entry in &entries {
-            all.push_str(&format!("{:016x}", entry.word));
-        }
-        // Never 0, which plants have.
-        let version = (fnv(&all) >> 32) as u32 | 1;
-
-        let name = interface.name.as_bytes();
-        let mut template = vec![MARK, name.len() as u8];
-        template.extend_from_slice(name);
-        template.extend_from_slice(&version.to_le_bytes());
-        template.push(interface.parameters.len() as u8);
-        let parameters = template.len() as u32;
-        for parameter in &interface.parameters {
-            template.extend_from_slice(&parameter.default.to_le_bytes());
-        }
-        template.extend_from_slice(&OWN_MARK.to_le_bytes());
-        template.extend_from_slice(&(entries.len() as u32).to_le_bytes());
-        for entry in &entries {
-            template.extend_from_slice(&entry.word.to_le_bytes());
-        }
-        let variables = template.len() as u32;
-        template.extend_from_slice(&0_i64.to_le_bytes());
-        template.push(FIRST);
-        if let Some(program) = checked.types.blocks.get(checked.program) {
-            for field in &program.fields {
-                template.extend_from_slice(&field.init);
-            }
-        }
-        if template.len() > STATE_MAX {
-            return Err(Error::State {
-                bytes: template.len(),
-                max: STATE_MAX,
-            });
-        }
-        Ok(Self {
-            version,
-            template,
-            entries,
-            parameters,
-            variables,
-            name: name.len() as u32,
-        })
-    }
-
-    /// Length of a state.
-    pub(crate) const fn bytes(&self) -> usize {
-        self.template.len()
-    }
-}
-
-/// The flag of a state that `start` made, and of one that `migrate` took over from the same program.
-const FIRST: u8 = 2;
-const CHANGED: i32 = 1;
 
 /// Addresses of constant data.
 #[derive(Debug)]
@@ -251,7 +76,11 @@ impl Tables {
         descriptor.extend(pair(ports_at, interface.ports.len() as u32));
         descriptor.extend(pair(parameters_at, interface.parameters.len() as u32));
         descriptor.extend(layout.version.to_le_bytes());
-        let entries: Vec<u8> = layout.entries.iter().flat_map(|entry| pair(entry.offset, entry.life as u32)).collect();
+        let entries: Vec<u8> = layout
+            .entries
+            .iter()
+            .flat_map(|entry| pair(entry.offset, entry.life as u32))
+            .collect();
         let sites: Vec<u8> = checked.sites.iter().flat_map(|site| data.text(site)).collect();
         Self {
             descriptor: data.put(&descriptor),
@@ -577,7 +406,13 @@ impl World<'_> {
         code.branch_if(bad);
         code.get(state);
         code.load(Scalar::Byte, 1);
-        code.all([I::LocalGet(state), I::I32Add, I::I32Const(7), I::I32Add, I::LocalTee(at_own)]);
+        code.all([
+            I::LocalGet(state),
+            I::I32Add,
+            I::I32Const(7),
+            I::I32Add,
+            I::LocalTee(at_own),
+        ]);
         code.all([I::LocalGet(end), I::I32GtU]);
         code.branch_if(bad);
         // The byte before is the number of parameters.
@@ -598,7 +433,14 @@ impl World<'_> {
         code.all([I::LocalGet(length), I::I32GtU]);
         code.branch_if(bad);
         code.all([I::LocalGet(at_own), I::I32Const(8), I::I32Add, I::LocalTee(old_table)]);
-        code.all([I::LocalGet(old_count), I::I32Const(8), I::I32Mul, I::I32Add, I::LocalGet(end), I::I32GtU]);
+        code.all([
+            I::LocalGet(old_count),
+            I::I32Const(8),
+            I::I32Mul,
+            I::I32Add,
+            I::LocalGet(end),
+            I::I32GtU,
+        ]);
         code.branch_if(bad);
 
         // The same program, by its name?
@@ -631,15 +473,40 @@ impl World<'_> {
         code.load(Scalar::Ulint, table);
         code.set(word);
         // The old variables lie behind their table.
-        code.all([I::LocalGet(old_table), I::LocalGet(old_count), I::I32Const(8), I::I32Mul, I::I32Add, I::LocalSet(old_at)]);
+        code.all([
+            I::LocalGet(old_table),
+            I::LocalGet(old_count),
+            I::I32Const(8),
+            I::I32Mul,
+            I::I32Add,
+            I::LocalSet(old_at),
+        ]);
         code.all([I::I32Const(0), I::LocalSet(m)]);
         let search = code.repeat();
         code.all([I::LocalGet(m), I::LocalGet(old_count), I::I32GeU]);
         code.branch_if(next);
-        code.all([I::LocalGet(old_table), I::LocalGet(m), I::I32Const(8), I::I32Mul, I::I32Add]);
+        code.all([
+            I::LocalGet(old_table),
+            I::LocalGet(m),
+            I::I32Const(8),
+            I::I32Mul,
+            I::I32Add,
+        ]);
         code.load(Scalar::Ulint, 0);
-        code.all([I::LocalTee(other), I::I32WrapI64, I::I32Const(0xffff), I::I32And, I::LocalSet(size)]);
-        code.all([I::LocalGet(old_at), I::LocalGet(size), I::I32Add, I::LocalGet(end), I::I32GtU]);
+        code.all([
+            I::LocalTee(other),
+            I::I32WrapI64,
+            I::I32Const(0xffff),
+            I::I32And,
+            I::LocalSet(size),
+        ]);
+        code.all([
+            I::LocalGet(old_at),
+            I::LocalGet(size),
+            I::I32Add,
+            I::LocalGet(end),
+            I::I32GtU,
+        ]);
         code.branch_if(bad);
         code.all([I::LocalGet(other), I::LocalGet(word), I::I64Eq]);
         code.when();
@@ -650,7 +517,14 @@ impl World<'_> {
         code.all([I::I32Add, I::LocalGet(old_at), I::LocalGet(size)]);
         code.copy();
         // The clock alone is no reason to take a state over.
-        code.all([I::LocalGet(taken), I::LocalGet(n), I::I32Const(0), I::I32Ne, I::I32Add, I::LocalSet(taken)]);
+        code.all([
+            I::LocalGet(taken),
+            I::LocalGet(n),
+            I::I32Const(0),
+            I::I32Ne,
+            I::I32Add,
+            I::LocalSet(taken),
+        ]);
         code.branch(next);
         code.end();
         code.all([I::LocalGet(old_at), I::LocalGet(size), I::I32Add, I::LocalSet(old_at)]);

@@ -20,7 +20,10 @@ impl Parser<'_> {
         if depth > DEPTH_MAX * 4 {
             self.sink.error(
                 span,
-                format!("this expression has more than {} operations in a row: split it", DEPTH_MAX * 4),
+                format!(
+                    "this expression has more than {} operations in a row: split it",
+                    DEPTH_MAX * 4
+                ),
             );
             return Err(Slip);
         }
@@ -108,7 +111,12 @@ impl Parser<'_> {
             {
                 self.bump();
                 let arguments = self.arguments()?;
-                let below = arguments.iter().map(|a| a.value.depth).max().unwrap_or(0).max(expr.depth);
+                let below = arguments
+                    .iter()
+                    .map(|a| a.value.depth)
+                    .max()
+                    .unwrap_or(0)
+                    .max(expr.depth);
                 let span = expr.span.to(self.before());
                 expr = self.node(ExprKind::Call(Box::new(expr), arguments), span, below)?;
             } else {
@@ -165,9 +173,7 @@ impl Parser<'_> {
             }
             Kind::Ident(word) if word == "TRUE" => leaf(ExprKind::Bool(true)),
             Kind::Ident(word) if word == "FALSE" => leaf(ExprKind::Bool(false)),
-            Kind::Ident(word) if !KEYWORDS.contains(&word.as_str()) => {
-                leaf(ExprKind::Name(Name { upper: word, span }))
-            }
+            Kind::Ident(word) if !KEYWORDS.contains(&word.as_str()) => leaf(ExprKind::Name(Name { upper: word, span })),
             Kind::Symbol("(") => {
                 self.bump();
                 let mut inner = self.expression()?;

@@ -10,8 +10,23 @@ use crate::{
 
 /// Words at which a statement that was not understood has ended at the latest.
 const ENDS: [&str; 17] = [
-    "END_IF", "ELSIF", "ELSE", "END_CASE", "END_FOR", "END_WHILE", "UNTIL", "END_REPEAT", "END_PROGRAM",
-    "END_FUNCTION", "END_FUNCTION_BLOCK", "IF", "CASE", "FOR", "WHILE", "REPEAT", "RETURN",
+    "END_IF",
+    "ELSIF",
+    "ELSE",
+    "END_CASE",
+    "END_FOR",
+    "END_WHILE",
+    "UNTIL",
+    "END_REPEAT",
+    "END_PROGRAM",
+    "END_FUNCTION",
+    "END_FUNCTION_BLOCK",
+    "IF",
+    "CASE",
+    "FOR",
+    "WHILE",
+    "REPEAT",
+    "RETURN",
 ];
 
 impl Parser<'_> {
@@ -130,8 +145,10 @@ impl Parser<'_> {
                 } else if self.is_symbol("=") {
                     return Err(self.expected("`:=`"));
                 } else if matches!(left.kind, ExprKind::Binary(crate::ast::Binary::Eq, ..)) {
-                    self.sink
-                        .error(start, "this compares and does nothing with the answer: an assignment is written `:=`");
+                    self.sink.error(
+                        start,
+                        "this compares and does nothing with the answer: an assignment is written `:=`",
+                    );
                     return Err(Slip);
                 } else {
                     return Err(self.expected("`:=` or a call"));
@@ -154,7 +171,11 @@ impl Parser<'_> {
                 break;
             }
         }
-        let otherwise = if self.take_word("ELSE") { self.statements(&["END_IF"]) } else { Vec::new() };
+        let otherwise = if self.take_word("ELSE") {
+            self.statements(&["END_IF"])
+        } else {
+            Vec::new()
+        };
         self.need_word("END_IF")?;
         Ok(StmtKind::If(branches, otherwise))
     }
@@ -168,7 +189,11 @@ impl Parser<'_> {
             let mut labels = Vec::new();
             loop {
                 let from = self.expression()?;
-                let to = if self.take_symbol("..") { Some(self.expression()?) } else { None };
+                let to = if self.take_symbol("..") {
+                    Some(self.expression()?)
+                } else {
+                    None
+                };
                 labels.push(Label { from, to });
                 if !self.take_symbol(",") {
                     break;
@@ -177,7 +202,11 @@ impl Parser<'_> {
             self.need_symbol(":")?;
             cases.push((labels, self.case_statements()));
         }
-        let otherwise = if self.take_word("ELSE") { self.statements(&["END_CASE"]) } else { Vec::new() };
+        let otherwise = if self.take_word("ELSE") {
+            self.statements(&["END_CASE"])
+        } else {
+            Vec::new()
+        };
         self.need_word("END_CASE")?;
         Ok(StmtKind::Case(selector, cases, otherwise))
     }
@@ -189,7 +218,11 @@ impl Parser<'_> {
         let from = self.expression()?;
         self.need_word("TO")?;
         let to = self.expression()?;
-        let by = if self.take_word("BY") { Some(self.expression()?) } else { None };
+        let by = if self.take_word("BY") {
+            Some(self.expression()?)
+        } else {
+            None
+        };
         self.need_word("DO")?;
         let body = self.statements(&["END_FOR"]);
         self.need_word("END_FOR")?;

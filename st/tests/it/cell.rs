@@ -28,7 +28,13 @@ pub(crate) fn compiled(source: &str) -> Compiled {
 /// One for all tests: each has a clock thread.
 fn engine() -> &'static Engine {
     static ENGINE: OnceLock<Engine> = OnceLock::new();
-    ENGINE.get_or_init(|| Engine::new(Config { instances_max: 256, ..Config::default() }).expect("engine"))
+    ENGINE.get_or_init(|| {
+        Engine::new(Config {
+            instances_max: 256,
+            ..Config::default()
+        })
+        .expect("engine")
+    })
 }
 
 impl Cell {
@@ -50,7 +56,11 @@ impl Cell {
         });
         let descriptor = prepared.descriptor().clone();
         let parameters: Vec<f64> = descriptor.parameters.iter().map(|p| p.default).collect();
-        let outputs = descriptor.ports.iter().filter(|p| p.direction == bumpless_core::Direction::Output).count();
+        let outputs = descriptor
+            .ports
+            .iter()
+            .filter(|p| p.direction == bumpless_core::Direction::Output)
+            .count();
         let mut from = track.to_vec();
         from.resize(outputs, 0.0);
         let mut instance = prepared.instantiate().expect("instance");
@@ -71,7 +81,10 @@ impl Cell {
     pub(crate) fn retune(&mut self, parameters: &[f64], track: &[f64]) {
         let from = self.origin();
         let state = self.state.clone();
-        self.state = self.instance.migrate(&from, &state, parameters, track, PATIENCE_NS).expect("retune");
+        self.state = self
+            .instance
+            .migrate(&from, &state, parameters, track, PATIENCE_NS)
+            .expect("retune");
     }
 
     pub(crate) fn origin(&self) -> Origin {
@@ -84,8 +97,14 @@ impl Cell {
 
     /// Takes a state of another over.
     pub(crate) fn take(&mut self, from: &Origin, state: &[u8], track: &[f64]) -> Result<(), Fault> {
-        let parameters: Vec<f64> =
-            self.instance.prepared().descriptor().parameters.iter().map(|p| p.default).collect();
+        let parameters: Vec<f64> = self
+            .instance
+            .prepared()
+            .descriptor()
+            .parameters
+            .iter()
+            .map(|p| p.default)
+            .collect();
         self.state = self.instance.migrate(from, state, &parameters, track, PATIENCE_NS)?;
         Ok(())
     }
@@ -143,7 +162,13 @@ impl Cell {
     }
 
     pub(crate) fn kinds(&self) -> Vec<PortKind> {
-        self.instance.prepared().descriptor().ports.iter().map(|port| port.kind).collect()
+        self.instance
+            .prepared()
+            .descriptor()
+            .ports
+            .iter()
+            .map(|port| port.kind)
+            .collect()
     }
 }
 

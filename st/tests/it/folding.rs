@@ -9,7 +9,17 @@ const TYPES: [(&str, &[&str]); 10] = [
     ("SINT", &["0", "1", "-1", "127", "-128", "5"]),
     ("INT", &["0", "1", "-1", "32767", "-32768", "77"]),
     ("DINT", &["0", "1", "-1", "2147483647", "-2147483648", "12345"]),
-    ("LINT", &["0", "1", "-1", "9223372036854775807", "-9223372036854775808", "98765432101"]),
+    (
+        "LINT",
+        &[
+            "0",
+            "1",
+            "-1",
+            "9223372036854775807",
+            "-9223372036854775808",
+            "98765432101",
+        ],
+    ),
     ("USINT", &["0", "1", "255", "128", "7"]),
     ("UINT", &["0", "1", "65535", "256", "7"]),
     ("UDINT", &["0", "1", "4294967295", "2147483648", "7"]),
@@ -36,7 +46,11 @@ fn leaf(ty: usize) -> impl Strategy<Value = Both> {
 fn expression(ty: usize) -> impl Strategy<Value = Both> {
     let (name, _) = TYPES[ty];
     let real = name.ends_with("REAL");
-    let whole: &[&str] = if real { &["+", "-", "*"] } else { &["+", "-", "*", "MOD", "/"] };
+    let whole: &[&str] = if real {
+        &["+", "-", "*"]
+    } else {
+        &["+", "-", "*", "MOD", "/"]
+    };
     let operators = prop::sample::select(whole.to_vec());
     let functions = prop::sample::select(vec!["MIN", "MAX"]);
     let to = prop::sample::select(TYPES.map(|(name, _)| name).to_vec());
@@ -44,7 +58,11 @@ fn expression(ty: usize) -> impl Strategy<Value = Both> {
         prop_oneof![
             (inner.clone(), operators.clone(), inner.clone()).prop_map(|(a, op, b)| join(&a, &b, |a, b| {
                 // A divisor that may be 0 is another test's.
-                if op == "/" || op == "MOD" { format!("({a} {op} MAX({b}, 1))") } else { format!("({a} {op} {b})") }
+                if op == "/" || op == "MOD" {
+                    format!("({a} {op} MAX({b}, 1))")
+                } else {
+                    format!("({a} {op} {b})")
+                }
             })),
             (inner.clone(), functions.clone(), inner.clone())
                 .prop_map(|(a, f, b)| join(&a, &b, |a, b| format!("{f}({a}, {b})"))),
@@ -55,7 +73,11 @@ fn expression(ty: usize) -> impl Strategy<Value = Both> {
             inner.clone().prop_map(|a| join(&a, &a, |a, _| format!("ABS({a})"))),
             // There and back again through another type.
             (inner, to.clone()).prop_map(move |(a, to)| join(&a, &a, |a, _| {
-                if to == name { a.to_owned() } else { format!("{to}_TO_{name}({name}_TO_{to}({a}))") }
+                if to == name {
+                    a.to_owned()
+                } else {
+                    format!("{to}_TO_{name}({name}_TO_{to}({a}))")
+                }
             })),
         ]
     })
@@ -70,7 +92,11 @@ fn join(a: &Both, b: &Both, make: impl Fn(&str, &str) -> String) -> Both {
 
 fn check(ty: usize, cases: &[Both]) {
     let (name, literals) = TYPES[ty];
-    let variables: String = literals.iter().enumerate().map(|(n, literal)| format!("v{n} : {name} := {literal}; ")).collect();
+    let variables: String = literals
+        .iter()
+        .enumerate()
+        .map(|(n, literal)| format!("v{n} : {name} := {literal}; "))
+        .collect();
     let (mut outputs, mut declared, mut body) = (String::new(), String::new(), String::new());
     for (n, case) in cases.iter().enumerate() {
         outputs.push_str(&format!("o{n} : BOOL; "));
@@ -81,7 +107,8 @@ fn check(ty: usize, cases: &[Both]) {
             case.variable, case.literal
         ));
     }
-    let source = format!("PROGRAM p VAR_OUTPUT {outputs} END_VAR VAR {variables} {declared} END_VAR\n{body}\nEND_PROGRAM");
+    let source =
+        format!("PROGRAM p VAR_OUTPUT {outputs} END_VAR VAR {variables} {declared} END_VAR\n{body}\nEND_PROGRAM");
     let given = Cell::new(&source).step(&[]);
     for (case, same) in cases.iter().zip(given) {
         assert!(same == 1.0, "{} is not {}", case.literal, case.variable);

@@ -6,33 +6,38 @@ use crate::cell::{Cell, values};
 
 #[test]
 fn operators_have_the_precedence_of_the_standard() {
-    values("", "", "", &[
-        ("1.0 + 2.0 * 3.0", 7.0),
-        ("(1.0 + 2.0) * 3.0", 9.0),
-        ("-2.0 ** 2.0", 4.0),
-        ("2.0 ** 3.0 ** 2.0", 64.0),
-        ("10.0 - 4.0 - 3.0", 3.0),
-        ("BOOL_TO_LREAL(TRUE OR FALSE AND FALSE)", 1.0),
-        ("BOOL_TO_LREAL(TRUE XOR TRUE AND FALSE)", 1.0),
-        ("BOOL_TO_LREAL(NOT FALSE AND FALSE)", 0.0),
-        ("BOOL_TO_LREAL(1 + 1 = 2)", 1.0),
-        ("BOOL_TO_LREAL(1 < 2 = TRUE)", 1.0),
-        ("BOOL_TO_LREAL(3 >= 3 & 2 <> 3)", 1.0),
-        ("7 / 2", 3.0),
-        ("-7 / 2", -3.0),
-        ("7 MOD -2", 1.0),
-        ("-7 MOD 2", -1.0),
-        ("16#FF", 255.0),
-        ("2#1010_0101", 165.0),
-        ("8#17", 15.0),
-        ("1_000", 1000.0),
-        ("1.5E-3", 0.0015),
-        ("INT#-5", -5.0),
-        ("REAL#1.5", 1.5),
-        ("TIME_TO_LREAL(T#1h1m1s1ms)", 3_661_001.0),
-        ("TIME_TO_LREAL(T#-1.5s)", -1500.0),
-        ("TIME_TO_LREAL(T#1d_2h)", 93_600_000.0),
-    ]);
+    values(
+        "",
+        "",
+        "",
+        &[
+            ("1.0 + 2.0 * 3.0", 7.0),
+            ("(1.0 + 2.0) * 3.0", 9.0),
+            ("-2.0 ** 2.0", 4.0),
+            ("2.0 ** 3.0 ** 2.0", 64.0),
+            ("10.0 - 4.0 - 3.0", 3.0),
+            ("BOOL_TO_LREAL(TRUE OR FALSE AND FALSE)", 1.0),
+            ("BOOL_TO_LREAL(TRUE XOR TRUE AND FALSE)", 1.0),
+            ("BOOL_TO_LREAL(NOT FALSE AND FALSE)", 0.0),
+            ("BOOL_TO_LREAL(1 + 1 = 2)", 1.0),
+            ("BOOL_TO_LREAL(1 < 2 = TRUE)", 1.0),
+            ("BOOL_TO_LREAL(3 >= 3 & 2 <> 3)", 1.0),
+            ("7 / 2", 3.0),
+            ("-7 / 2", -3.0),
+            ("7 MOD -2", 1.0),
+            ("-7 MOD 2", -1.0),
+            ("16#FF", 255.0),
+            ("2#1010_0101", 165.0),
+            ("8#17", 15.0),
+            ("1_000", 1000.0),
+            ("1.5E-3", 0.0015),
+            ("INT#-5", -5.0),
+            ("REAL#1.5", 1.5),
+            ("TIME_TO_LREAL(T#1h1m1s1ms)", 3_661_001.0),
+            ("TIME_TO_LREAL(T#-1.5s)", -1500.0),
+            ("TIME_TO_LREAL(T#1d_2h)", 93_600_000.0),
+        ],
+    );
 }
 
 #[test]
@@ -41,88 +46,110 @@ fn whole_numbers_wrap_in_their_type() {
                      ud : UDINT := 4294967295; l : LINT := 9223372036854775807; sm : SINT := -128; dm : DINT := -2147483648; \
                      b : BYTE := 16#81; w : WORD := 16#8001; m1 : SINT := -1; d1 : DINT := -1; n : INT := 3";
     let statements = "s := s + 1; us := us + 1; i := i + 1; ui := ui + 1; d := d + 1; ud := ud + 1; l := l + 1;";
-    values("", &format!("{variables};"), statements, &[
-        ("s", -128.0),
-        ("us", 0.0),
-        ("i", -32768.0),
-        ("ui", 0.0),
-        ("d", -2_147_483_648.0),
-        ("ud", 0.0),
-        ("LINT_TO_LREAL(l)", -9_223_372_036_854_775_808.0),
-        ("sm / m1", -128.0),
-        ("dm / d1", -2_147_483_648.0),
-        ("dm MOD d1", 0.0),
-        ("ABS(sm)", -128.0),
-        ("BYTE_TO_USINT(NOT b)", 126.0),
-        ("BYTE_TO_USINT(SHL(b, 1))", 2.0),
-        ("BYTE_TO_USINT(SHR(b, n))", 16.0),
-        ("BYTE_TO_USINT(ROL(b, 1))", 3.0),
-        ("BYTE_TO_USINT(ROR(b, 1))", 192.0),
-        ("BYTE_TO_USINT(ROL(b, 9))", 3.0),
-        ("WORD_TO_UINT(ROL(w, n))", 12.0),
-        ("WORD_TO_UINT(SHL(w, 16))", 0.0),
-        ("WORD_TO_UINT(w AND 16#FF OR 16#100)", 257.0),
-        ("BYTE_TO_USINT(b XOR b)", 0.0),
-    ]);
+    values(
+        "",
+        &format!("{variables};"),
+        statements,
+        &[
+            ("s", -128.0),
+            ("us", 0.0),
+            ("i", -32768.0),
+            ("ui", 0.0),
+            ("d", -2_147_483_648.0),
+            ("ud", 0.0),
+            ("LINT_TO_LREAL(l)", -9_223_372_036_854_775_808.0),
+            ("sm / m1", -128.0),
+            ("dm / d1", -2_147_483_648.0),
+            ("dm MOD d1", 0.0),
+            ("ABS(sm)", -128.0),
+            ("BYTE_TO_USINT(NOT b)", 126.0),
+            ("BYTE_TO_USINT(SHL(b, 1))", 2.0),
+            ("BYTE_TO_USINT(SHR(b, n))", 16.0),
+            ("BYTE_TO_USINT(ROL(b, 1))", 3.0),
+            ("BYTE_TO_USINT(ROR(b, 1))", 192.0),
+            ("BYTE_TO_USINT(ROL(b, 9))", 3.0),
+            ("WORD_TO_UINT(ROL(w, n))", 12.0),
+            ("WORD_TO_UINT(SHL(w, 16))", 0.0),
+            ("WORD_TO_UINT(w AND 16#FF OR 16#100)", 257.0),
+            ("BYTE_TO_USINT(b XOR b)", 0.0),
+        ],
+    );
 }
 
 #[test]
 fn conversions_round_stay_in_range_or_keep_low_bits() {
     let variables = "x : LREAL := 2.5; y : LREAL := 3.5; big : LREAL := 1.0E20; low : REAL := -1.0E20; i : INT := 300; m : INT := -1; \
                      u : UDINT := 4000000000; t : TIME := T#1500ms; z : REAL := -2.7; w : DWORD := 16#FFFF_FFFF";
-    values("", &format!("{variables};"), "", &[
-        ("LREAL_TO_INT(x)", 2.0),
-        ("LREAL_TO_INT(y)", 4.0),
-        ("LREAL_TO_INT(big)", 32767.0),
-        ("REAL_TO_SINT(low)", -128.0),
-        ("REAL_TO_UDINT(low)", 0.0),
-        ("REAL_TO_UINT(z)", 0.0),
-        ("REAL_TO_INT(z)", -3.0),
-        ("TRUNC(z)", -2.0),
-        ("REAL_TRUNC_SINT(z)", -2.0),
-        ("INT_TO_SINT(i)", 44.0),
-        ("INT_TO_UINT(m)", 65535.0),
-        ("INT_TO_BOOL(i) AND TRUE = TRUE", 1.0),
-        ("UDINT_TO_LREAL(u)", 4e9),
-        ("UDINT_TO_DINT(u)", -294_967_296.0),
-        ("TIME_TO_DINT(t)", 1500.0),
-        ("TIME_TO_LREAL(LREAL_TO_TIME(x))", 2.5),
-        ("TIME_TO_LREAL(DINT_TO_TIME(7))", 7.0),
-        ("TO_DINT(x)", 2.0),
-        ("DWORD_TO_DINT(w)", -1.0),
-        ("BOOL_TO_INT(INT_TO_BOOL(i))", 1.0),
-        ("TIME_TO_LREAL(t * 2)", 3000.0),
-        ("TIME_TO_LREAL(t * 0.5 + T#1s)", 1750.0),
-        ("TIME_TO_LREAL(2.0 * t)", 3000.0),
-        ("TIME_TO_LREAL(t / 3)", 500.0),
-    ].map(|(e, v)| if e.starts_with("INT_TO_BOOL") { ("BOOL_TO_LREAL(INT_TO_BOOL(i) AND TRUE = TRUE)", v) } else { (e, v) }));
+    values(
+        "",
+        &format!("{variables};"),
+        "",
+        &[
+            ("LREAL_TO_INT(x)", 2.0),
+            ("LREAL_TO_INT(y)", 4.0),
+            ("LREAL_TO_INT(big)", 32767.0),
+            ("REAL_TO_SINT(low)", -128.0),
+            ("REAL_TO_UDINT(low)", 0.0),
+            ("REAL_TO_UINT(z)", 0.0),
+            ("REAL_TO_INT(z)", -3.0),
+            ("TRUNC(z)", -2.0),
+            ("REAL_TRUNC_SINT(z)", -2.0),
+            ("INT_TO_SINT(i)", 44.0),
+            ("INT_TO_UINT(m)", 65535.0),
+            ("INT_TO_BOOL(i) AND TRUE = TRUE", 1.0),
+            ("UDINT_TO_LREAL(u)", 4e9),
+            ("UDINT_TO_DINT(u)", -294_967_296.0),
+            ("TIME_TO_DINT(t)", 1500.0),
+            ("TIME_TO_LREAL(LREAL_TO_TIME(x))", 2.5),
+            ("TIME_TO_LREAL(DINT_TO_TIME(7))", 7.0),
+            ("TO_DINT(x)", 2.0),
+            ("DWORD_TO_DINT(w)", -1.0),
+            ("BOOL_TO_INT(INT_TO_BOOL(i))", 1.0),
+            ("TIME_TO_LREAL(t * 2)", 3000.0),
+            ("TIME_TO_LREAL(t * 0.5 + T#1s)", 1750.0),
+            ("TIME_TO_LREAL(2.0 * t)", 3000.0),
+            ("TIME_TO_LREAL(t / 3)", 500.0),
+        ]
+        .map(|(e, v)| {
+            if e.starts_with("INT_TO_BOOL") {
+                ("BOOL_TO_LREAL(INT_TO_BOOL(i) AND TRUE = TRUE)", v)
+            } else {
+                (e, v)
+            }
+        }),
+    );
 }
 
 #[test]
 fn standard_functions_choose_and_limit() {
     let variables = "k : INT := 2; g : BOOL := TRUE; a : REAL := 3.5; e : colour := green; f : INT := -7";
-    values("TYPE colour : (red, green := 5, blue); END_TYPE", &format!("{variables};"), "", &[
-        ("MIN(3.0, 1.0, 2.0)", 1.0),
-        ("MAX(k, 1, f)", 2.0),
-        ("LIMIT(0.0, a, 3.0)", 3.0),
-        ("LIMIT(MN := 4, IN := k, MX := 9)", 4.0),
-        ("SEL(g, 1.0, 2.0)", 2.0),
-        ("SEL(G := NOT g, IN0 := 1.0, IN1 := 2.0)", 1.0),
-        ("MUX(k, 10.0, 20.0, 30.0)", 30.0),
-        ("MUX(9, 10.0, 20.0, 30.0)", 30.0),
-        ("MUX(f, 10.0, 20.0, 30.0)", 10.0),
-        ("ABS(f)", 7.0),
-        ("ABS(-2.5)", 2.5),
-        ("ADD(1, 2, 3)", 6.0),
-        ("BOOL_TO_LREAL(GT(a, 3.0))", 1.0),
-        ("MOVE(a)", 3.5),
-        ("SQRT(16.0)", 4.0),
-        ("TO_DINT(e)", 5.0),
-        ("TO_DINT(blue)", 6.0),
-        ("BOOL_TO_LREAL(e = colour#green)", 1.0),
-        ("TO_DINT(SEL(g, red, blue))", 6.0),
-        ("EXPT(2.0, 10)", 1024.0),
-    ]);
+    values(
+        "TYPE colour : (red, green := 5, blue); END_TYPE",
+        &format!("{variables};"),
+        "",
+        &[
+            ("MIN(3.0, 1.0, 2.0)", 1.0),
+            ("MAX(k, 1, f)", 2.0),
+            ("LIMIT(0.0, a, 3.0)", 3.0),
+            ("LIMIT(MN := 4, IN := k, MX := 9)", 4.0),
+            ("SEL(g, 1.0, 2.0)", 2.0),
+            ("SEL(G := NOT g, IN0 := 1.0, IN1 := 2.0)", 1.0),
+            ("MUX(k, 10.0, 20.0, 30.0)", 30.0),
+            ("MUX(9, 10.0, 20.0, 30.0)", 30.0),
+            ("MUX(f, 10.0, 20.0, 30.0)", 10.0),
+            ("ABS(f)", 7.0),
+            ("ABS(-2.5)", 2.5),
+            ("ADD(1, 2, 3)", 6.0),
+            ("BOOL_TO_LREAL(GT(a, 3.0))", 1.0),
+            ("MOVE(a)", 3.5),
+            ("SQRT(16.0)", 4.0),
+            ("TO_DINT(e)", 5.0),
+            ("TO_DINT(blue)", 6.0),
+            ("BOOL_TO_LREAL(e = colour#green)", 1.0),
+            ("TO_DINT(SEL(g, red, blue))", 6.0),
+            ("EXPT(2.0, 10)", 1024.0),
+        ],
+    );
 }
 
 #[test]
@@ -219,7 +246,11 @@ h := l;
 END_PROGRAM";
     let mut cell = Cell::new(source);
     assert_eq!(cell.step(&[]), [6.0, 22.0, 39.0, 6.0, 6.0, 43.0, 21.0, 7.0]);
-    assert_eq!(cell.step(&[])[3..7], [12.0, 12.0, 43.0, 12.0], "blocks keep their variables, and so does the program");
+    assert_eq!(
+        cell.step(&[])[3..7],
+        [12.0, 12.0, 43.0, 12.0],
+        "blocks keep their variables, and so does the program"
+    );
 }
 
 #[test]
@@ -274,7 +305,11 @@ END_PROGRAM";
     assert_eq!(cell.step(&[5.0, 6.6, 3.0]), [0.0, 1.0], "7 after rounding");
     assert_eq!(cell.step(&[5.0, 4.0, 0.0]), [100.0, 0.0], "held within its range");
     let effects = cell.try_step(100, &[None, Some(4.0), Some(1.0)]).unwrap();
-    assert_eq!(effects.writes, [(3, 100.0), (4, 0.0)], "the last good value, and the program knows");
+    assert_eq!(
+        effects.writes,
+        [(3, 100.0), (4, 0.0)],
+        "the last good value, and the program knows"
+    );
     let fault = cell.try_step(100, &[Some(1.0), Some(4.0), None]).unwrap_err();
     assert_eq!(fault, Fault::BadInput("input switch has no usable value".to_owned()));
 }
@@ -291,11 +326,19 @@ END_PROGRAM";
     let mut cell = Cell::tracking(source, &[55.0]);
     cell.held[0] = 55.0;
     cell.setpoint = 3.0;
-    assert_eq!(cell.step_of(250, &[]), [3.0, 1.0, 11.0, 250.0, 1.0, 1.0], "the first cycle goes on from the actuators");
+    assert_eq!(
+        cell.step_of(250, &[]),
+        [3.0, 1.0, 11.0, 250.0, 1.0, 1.0],
+        "the first cycle goes on from the actuators"
+    );
     assert_eq!(cell.step(&[]), [3.0, 1.0, 0.0, 100.0, 2.0, 1.0]);
     cell.mode = Mode::Manual;
     cell.held[0] = 55.0;
-    assert_eq!(cell.step(&[]), [3.0, 0.0, 10.0, 100.0, 3.0, 2.0], "so does each in manual");
+    assert_eq!(
+        cell.step(&[]),
+        [3.0, 0.0, 10.0, 100.0, 3.0, 2.0],
+        "so does each in manual"
+    );
 }
 
 #[test]

@@ -37,7 +37,11 @@ fn a_start_and_a_retune_go_on_from_the_actuator() {
     assert!(cell.step(&[8.0])[0] > 37.5);
     let before = cell.held[1];
     cell.retune(&[9.0, 5.0], &[before]);
-    assert_eq!(cell.step(&[8.0]), [before], "the gain is another, the output is the same");
+    assert_eq!(
+        cell.step(&[8.0]),
+        [before],
+        "the gain is another, the output is the same"
+    );
     assert!(cell.step(&[8.0])[0] > before);
 }
 
@@ -60,7 +64,9 @@ fn a_new_version_takes_over_what_it_still_has() {
 #[test]
 fn another_program_takes_over_what_is_retained() {
     let old = run(PI);
-    let other = PI.replace("PROGRAM pi", "PROGRAM pi_two").replace("VAR e : LREAL", "VAR other, e : LREAL");
+    let other = PI
+        .replace("PROGRAM pi", "PROGRAM pi_two")
+        .replace("VAR e : LREAL", "VAR other, e : LREAL");
     let mut new = Cell::new(&other);
     new.setpoint = 10.0;
     new.take(&old.origin(), &old.state, &[old.held[1]]).unwrap();
@@ -68,7 +74,9 @@ fn another_program_takes_over_what_is_retained() {
     let given = new.step(&[2.0]);
     assert!((given[0] - old.held[1]).abs() < 1e-12, "{given:?}, {}", old.held[1]);
 
-    let plain = PI.replace("PROGRAM pi", "PROGRAM pi_three").replace("VAR RETAIN", "VAR");
+    let plain = PI
+        .replace("PROGRAM pi", "PROGRAM pi_three")
+        .replace("VAR RETAIN", "VAR");
     let fault = Cell::new(&plain).take(&old.origin(), &old.state, &[0.0]).unwrap_err();
     assert_eq!(
         fault,
@@ -80,9 +88,18 @@ fn another_program_takes_over_what_is_retained() {
 fn what_is_no_state_is_declined_and_no_length_is_believed() {
     let old = run(PI);
     let mut new = Cell::new(PI);
-    let foreign = Origin { name: "pid".to_owned(), version: "1.0.0".to_owned(), state_layout: 1 };
+    let foreign = Origin {
+        name: "pid".to_owned(),
+        version: "1.0.0".to_owned(),
+        state_layout: 1,
+    };
     let declined = Fault::BadState("the state is not one of a Structured Text program".to_owned());
-    for state in [vec![], vec![0xB1], vec![0; 100], b"\xB1\x03pid\x01\0\0\0\0abcdefghijkl".to_vec()] {
+    for state in [
+        vec![],
+        vec![0xB1],
+        vec![0; 100],
+        b"\xB1\x03pid\x01\0\0\0\0abcdefghijkl".to_vec(),
+    ] {
         assert_eq!(new.take(&foreign, &state, &[0.0]), Err(declined.clone()), "{state:?}");
     }
     // Cut anywhere, and with any byte another one: an answer in words, never a trap.
@@ -101,7 +118,10 @@ fn what_is_no_state_is_declined_and_no_length_is_believed() {
     let mut cell = Cell::new(PI);
     cell.state = vec![0xB1; cell.state.len()];
     let fault = cell.try_step(100, &[Some(1.0)]).unwrap_err();
-    assert_eq!(fault, Fault::BadState("the state belongs to another component or layout".to_owned()));
+    assert_eq!(
+        fault,
+        Fault::BadState("the state belongs to another component or layout".to_owned())
+    );
 }
 
 #[test]

@@ -53,7 +53,7 @@ pub(crate) struct DevArgs {
     /// The loop that runs it.
     #[arg(long = "loop", value_name = "LOOP")]
     pub(crate) name: String,
-    /// Stop after so many builds that came into force.
+    /// Stop after so many builds; failed where the last one did not come into force.
     #[arg(long, value_name = "N")]
     pub(crate) builds: Option<u32>,
 }

@@ -29,7 +29,9 @@ pub(crate) fn new(args: &NewArgs) -> Result<(), Error> {
     let sdk = args.sdk.clone().or_else(bumpless_build::sdk_near);
     let folder = bumpless_build::create(language, Path::new(""), &args.name, sdk.as_deref()).map_err(failed)?;
     let folder = folder.display();
-    show::line(&format!("{folder}: its README says how to go on; first `bumpless check {folder}`"))
+    show::line(&format!(
+        "{folder}: its README says how to go on; first `bumpless check {folder}`"
+    ))
 }
 
 /// What does not build is the author's to mend: its message says where.
@@ -54,7 +56,11 @@ pub(crate) fn build(args: &BuildArgs) -> Result<(), Error> {
     let Built { component, output, .. } = bumpless_build::build(&args.source, None).map_err(failed)?;
     let output = args.output.as_ref().unwrap_or(&output);
     write(output, &component)?;
-    show::line(&format!("{} ({})", output.display(), show::size(component.len() as u64)))
+    show::line(&format!(
+        "{} ({})",
+        output.display(),
+        show::size(component.len() as u64)
+    ))
 }
 
 /// Builds where there is something to build, and tries what comes out as an upload would.
@@ -101,7 +107,11 @@ pub(crate) fn check(json: bool, args: &CheckArgs) -> Result<(), Error> {
         show::json(&text)?;
     } else {
         show::line(&format!("{}@{}  {}", d.name, d.version, d.text))?;
-        show::line(&format!("digest    {}, {}", inspection.digest.short(), show::size(bytes.len() as u64)))?;
+        show::line(&format!(
+            "digest    {}, {}",
+            inspection.digest.short(),
+            show::size(bytes.len() as u64)
+        ))?;
         for line in library::report(&report) {
             show::line(&line)?;
         }
@@ -111,8 +121,13 @@ pub(crate) fn check(json: bool, args: &CheckArgs) -> Result<(), Error> {
                 bumpless_core::Direction::Input => "input",
                 bumpless_core::Direction::Output => "output",
             };
-            let kind = if port.kind == PortKind::Digital { ", on or off" } else { "" };
-            table.add_row([&port.name, &format!("{direction}{kind}"), &port.unit, "", &port.text]);
+            let kind = if port.kind == PortKind::Digital {
+                ", on or off"
+            } else {
+                ""
+            };
+            let what = format!("{direction}{kind}");
+            table.add_row([port.name.as_str(), &what, &port.unit, "", &port.text]);
         }
         for p in &d.parameters {
             let range = if p.choices.is_empty() {

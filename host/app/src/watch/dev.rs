@@ -34,7 +34,7 @@ const SHOW_EVERY: Duration = Duration::from_secs(1);
 /// Pause after which a save counts as whole.
 const SAVES_SETTLE: Duration = Duration::from_millis(50);
 
-/// Runs until Ctrl-C, or until so many builds came into force.
+/// Runs until Ctrl-C, or until so many builds were made; then what became of the last one is the answer.
 pub(crate) fn run(client: &Client, args: &DevArgs) -> Result<(), Error> {
     // Asked first, so that a wrong name is an error and not a silence.
     let path = format!("/v1/loops/{}", encoded(&args.name));
@@ -43,33 +43,43 @@ pub(crate) fn run(client: &Client, args: &DevArgs) -> Result<(), Error> {
     let stop = stop::on_signals()?;
     let mut watch = Watch::new(&args.source);
     let mut before: Option<String> = None;
-    let mut done = 0;
+    let mut builds = 0;
     let mut due = true;
-    let mut shown = Instant::now();
+    let (mut shown, mut looked) = (Instant::now(), Instant::now());
     while !stop.load(Ordering::Relaxed) {
         if due {
+            builds += 1;
+            let last = args.builds.is_some_and(|most| builds >= most);
             match once(client, args, &path, before.as_deref()) {
-                Ok(digest) => {
-                    before = Some(digest);
-                    done += 1;
-                    if args.builds.is_some_and(|builds| done >= builds) {
-                        return Ok(());
-                    }
-                }
-                Err(error @ Error::Unreachable { .. }) => return Err(error),
+                Ok(digest) => before = Some(digest),
+                Err(error) if last || matches!(error, Error::Unreachable { .. }) => return Err(error),
                 Err(error) => show::note(&error.report()),
             }
+            if last {
+                return Ok(());
+            }
+            due = false;
         }
-        if let Some(News::Record(record, _)) = feed.next(LOOK_EVERY)
-            && shown.elapsed() >= SHOW_EVERY
-        {
-            show::line(&row(&record))?;
-            shown = Instant::now();
+        match feed.next(LOOK_EVERY) {
+            Some(News::Record(record, _)) if shown.elapsed() >= SHOW_EVERY => {
+                show::line(&row(&record))?;
+                shown = Instant::now();
+            }
+            Some(News::Gone(reason)) => {
+                return Err(Error::Unreachable {
+                    api: client.api().to_owned(),
+                    reason,
+                });
+            }
+            _ => {}
         }
-        due = watch.changed();
-        if due {
-            // An editor writes several files, or one in parts: the rest of this save belongs to it.
-            while watch.changed_after(SAVES_SETTLE) {}
+        if looked.elapsed() >= LOOK_EVERY {
+            looked = Instant::now();
+            due = watch.changed();
+            if due {
+                // An editor writes several files, or one in parts: the rest of this save belongs to it.
+                while watch.changed_after(SAVES_SETTLE) {}
+            }
         }
     }
     Ok(())
@@ -82,8 +92,12 @@ fn once(client: &Client, args: &DevArgs, path: &str, before: Option<&str>) -> Re
     let built = bumpless_build::build(&args.source, Some(&version)).map_err(author::failed)?;
     let built_in = from.elapsed();
     author::write(&built.output, &built.component)?;
-    let (component, _): (Component, String) =
-        components::send(client, &built.output, "note=dev&labels=dev%3Dyes&force=false&dry_run=false", false)?;
+    let (component, _): (Component, String) = components::send(
+        client,
+        &built.output,
+        "note=dev&labels=dev%3Dyes&force=false&dry_run=false",
+        false,
+    )?;
     let swap = SwapRequest {
         component: component.digest.clone(),
     };
