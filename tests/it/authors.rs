@@ -36,7 +36,7 @@ END_VAR
 VAR_EXTERNAL setpoint : LREAL; track : BOOL; dt : TIME; END_VAR
 VAR RETAIN integral : LREAL; END_VAR
 VAR e : LREAL; END_VAR
-e := setpoint - pv;
+e := LIMIT(-100.0, setpoint - pv, 100.0);
 IF track THEN integral := out - k * e;
 ELSE integral := LIMIT(-k * e, integral + k * e * TIME_TO_LREAL(dt) / 1000.0 / ti, 10.0 - k * e); END_IF;
 out := integral + k * e;
