@@ -15,6 +15,7 @@
 
 mod body;
 mod helpers;
+mod lines;
 mod operation;
 mod state;
 mod world;
@@ -22,15 +23,16 @@ mod world;
 use std::borrow::Cow;
 
 use wasm_encoder::{
-    BlockType, CodeSection, ConstExpr, DataSection, EntityType, ExportKind, ExportSection, Function, FunctionSection,
-    GlobalSection, GlobalType, ImportSection, Instruction, MemArg, MemorySection, MemoryType, Module, NameMap,
-    NameSection, TypeSection, ValType,
+    BlockType, CodeSection, ConstExpr, CustomSection, DataSection, EntityType, ExportKind, ExportSection, Function,
+    FunctionSection, GlobalSection, GlobalType, ImportSection, Instruction, MemArg, MemorySection, MemoryType, Module,
+    NameMap, NameSection, TypeSection, ValType,
 };
 use wit_component::{ComponentEncoder, StringEncoding, embed_component_metadata};
 use wit_parser::Resolve;
 
 use crate::{ast::PouKind, check::Checked, error::Error, types::Scalar};
 
+pub(crate) use lines::Text;
 pub(crate) use state::Layout;
 
 /// Where a call's result lies.
@@ -85,6 +87,8 @@ struct Code {
     instructions: Vec<Instruction<'static>>,
     /// Blocks that are open.
     depth: u32,
+    /// Number of an instruction, and the place in the text from which on it and those behind it come.
+    marks: Vec<(usize, u32)>,
 }
 
 impl Code {
@@ -196,13 +200,26 @@ impl Code {
         });
     }
 
-    fn function(&self) -> Function {
+    fn mark(&mut self, place: u32) {
+        self.marks.push((self.instructions.len(), place));
+    }
+
+    /// The function, and its marks with offsets in bytes.
+    fn function(&self) -> (Function, Vec<(u32, u32)>) {
         let mut function = Function::new_with_locals_types(self.locals.iter().copied());
-        for instruction in &self.instructions {
+        let mut marks = self.marks.iter().peekable();
+        let mut places: Vec<(u32, u32)> = Vec::new();
+        for (n, instruction) in self.instructions.iter().enumerate() {
+            // Of marks at one instruction the innermost counts.
+            while let Some((_, place)) = marks.next_if(|(at, _)| *at == n) {
+                let offset = function.byte_len() as u32;
+                places.pop_if(|(last, _)| *last == offset);
+                places.push((offset, *place));
+            }
             function.instruction(instruction);
         }
         function.instruction(&Instruction::End);
-        function
+        (function, places)
     }
 }
 
@@ -285,8 +302,8 @@ struct Plan<'a> {
     frames: u32,
 }
 
-/// Writes the component. Gives its bytes and what lies in its state.
-pub(crate) fn emit(checked: &Checked<'_>) -> Result<(Vec<u8>, Layout), Error> {
+/// Writes the component, with lines where its text is given. Gives its bytes and what lies in its state.
+pub(crate) fn emit(checked: &Checked<'_>, text: Option<Text<'_>>) -> Result<(Vec<u8>, Layout), Error> {
     let layout = Layout::of(checked)?;
     let mut data = Data { bytes: Vec::new() };
     let tables = world::Tables::put(&mut data, checked, &layout);
@@ -317,11 +334,11 @@ pub(crate) fn emit(checked: &Checked<'_>) -> Result<(Vec<u8>, Layout), Error> {
         }
     }
     world::add(&mut functions, &plan, &layout, &tables);
-    let module = module(&functions, &data, heap);
+    let module = module(&functions, &data, heap, &layout.form, text)?;
     Ok((component(module)?, layout))
 }
 
-fn module(functions: &Functions, data: &Data, heap: u32) -> Vec<u8> {
+fn module(functions: &Functions, data: &Data, heap: u32, form: &str, text: Option<Text<'_>>) -> Result<Vec<u8>, Error> {
     let mut types = TypeSection::new();
     let mut imports = ImportSection::new();
     types.ty().function([ValType::I32, ValType::I32], []);
@@ -372,8 +389,25 @@ fn module(functions: &Functions, data: &Data, heap: u32) -> Vec<u8> {
     }
     let mut segments = DataSection::new();
     segments.active(0, &ConstExpr::i32_const(DATA_AT as i32), data.bytes.iter().copied());
-    for (_, code) in &functions.codes {
-        codes.function(&code.function());
+    let leb = |number: usize| (usize::BITS - number.leading_zeros()).div_ceil(7).max(1) as usize;
+    let mut stretches = Vec::new();
+    for (name, code) in &functions.codes {
+        let (function, marks) = code.function();
+        // Behind the number of functions, the functions before, and the length of this one.
+        let begin = leb(functions.codes.len()) + codes.byte_len() + leb(function.byte_len());
+        let at = |offset: usize| (begin + offset) as u32;
+        if !marks.is_empty() {
+            stretches.push(lines::Stretch {
+                name: name.clone(),
+                begin: at(0),
+                end: at(function.byte_len()),
+                marks: marks
+                    .into_iter()
+                    .map(|(offset, place)| (at(offset as usize), place))
+                    .collect(),
+            });
+        }
+        codes.function(&function);
     }
     let mut name_section = NameSection::new();
     name_section.functions(&names);
@@ -387,8 +421,21 @@ fn module(functions: &Functions, data: &Data, heap: u32) -> Vec<u8> {
         .section(&exports)
         .section(&codes)
         .section(&segments)
-        .section(&name_section);
-    module.finish()
+        .section(&name_section)
+        .section(&CustomSection {
+            name: state::FORM_SECTION.into(),
+            data: form.as_bytes().into(),
+        });
+    if let Some(text) = text {
+        let sections = lines::sections(text, &stretches).map_err(|error| Error::Encode(error.to_string().into()))?;
+        for (name, data) in &sections {
+            module.section(&CustomSection {
+                name: (*name).into(),
+                data: data.as_slice().into(),
+            });
+        }
+    }
+    Ok(module.finish())
 }
 
 /// The module with the world's types around it.

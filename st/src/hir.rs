@@ -144,6 +144,8 @@ pub(crate) enum Argument {
 
 #[derive(Debug, Clone)]
 pub(crate) enum Stmt {
+    /// What follows stands here in the text, in bytes.
+    At(u32),
     Assign(Place, Expr),
     /// Structures and arrays: so many bytes.
     Copy(Place, Place, u32),

@@ -37,6 +37,7 @@ pub use diagnostic::{DIAGNOSTICS_MAX, Diagnostic};
 pub use error::Error;
 
 use diagnostic::Sink;
+use emit::Text;
 
 /// Longest text, in bytes: some ten thousand lines, more than one controller should be.
 pub const SOURCE_BYTES_MAX: usize = 1024 * 1024;
@@ -76,6 +77,18 @@ pub fn compile(source: &str) -> Result<Compiled, Error> {
 /// # Errors
 /// As [`compile`].
 pub fn compile_as(source: &str, version: Option<&str>) -> Result<Compiled, Error> {
+    compiled(source, version, None)
+}
+
+/// As [`compile`], with what says of each instruction which line it comes from (DWARF); `file` is what the text's file is called.
+///
+/// # Errors
+/// As [`compile`].
+pub fn compile_with_lines(source: &str, file: &str) -> Result<Compiled, Error> {
+    compiled(source, None, Some(Text { file, source }))
+}
+
+fn compiled(source: &str, version: Option<&str>, text: Option<Text<'_>>) -> Result<Compiled, Error> {
     if source.len() > SOURCE_BYTES_MAX {
         return Err(Error::TooLong {
             bytes: source.len(),
@@ -96,7 +109,7 @@ pub fn compile_as(source: &str, version: Option<&str>) -> Result<Compiled, Error
     if let Some(version) = version {
         version.clone_into(&mut checked.interface.version);
     }
-    let (component, layout) = emit::emit(&checked)?;
+    let (component, layout) = emit::emit(&checked, text)?;
     let interface = checked.interface;
     Ok(Compiled {
         component,

@@ -9,10 +9,15 @@ use crate::{
 
 impl Checker<'_> {
     pub(super) fn statements(&mut self, statements: &[ast::Stmt]) -> Vec<Stmt> {
-        statements
-            .iter()
-            .filter_map(|statement| self.statement(statement))
-            .collect()
+        let own = self.pous.get(self.current).is_some_and(|pou| !pou.library);
+        let mut checked = Vec::new();
+        for statement in statements {
+            if let Some(found) = self.statement(statement) {
+                checked.extend(own.then_some(Stmt::At(statement.span.start)));
+                checked.push(found);
+            }
+        }
+        checked
     }
 
     fn condition(&mut self, expr: &ast::Expr) -> Expr {

@@ -206,6 +206,7 @@ impl Writer<'_, '_> {
 
     fn statement(&mut self, statement: &Stmt) {
         match statement {
+            Stmt::At(place) => self.code.mark(*place),
             Stmt::Assign(place, value) => self.assign(place, value),
             Stmt::Copy(to, from, bytes) => {
                 self.whole_address(to);

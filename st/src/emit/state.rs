@@ -29,6 +29,8 @@ pub(super) const MARK: u8 = 0xB1;
 pub(super) const OWN_MARK: u32 = u32::from_le_bytes(*b"BST1");
 /// Greatest state, in bytes, as the host has it.
 const STATE_MAX: usize = 64 * 1024;
+/// The custom section that says what a state consists of: a line `packed 1`, then `name: type` for each value in its order.
+pub(super) const FORM_SECTION: &str = "bumpless:state";
 /// Of the variables: a clock for timers, then one byte that tells what the next step is.
 pub(super) const HIDDEN: u32 = 9;
 pub(super) const FLAG_AT: u32 = 8;
@@ -70,6 +72,8 @@ pub(crate) struct Layout {
     pub(super) variables: u32,
     /// Length of the name.
     pub(super) name: u32,
+    /// The variables in words, for who reads a state: the custom section of [`FORM_SECTION`].
+    pub(super) form: String,
 }
 
 fn fnv(text: &str) -> u64 {
@@ -82,12 +86,43 @@ struct Leaves<'a> {
     types: &'a Types,
     checked: &'a Checked<'a>,
     entries: Vec<Entry>,
+    form: String,
+}
+
+/// What a value is called in the form.
+fn word(types: &Types, ty: &Ty) -> String {
+    match ty {
+        Ty::Scalar(Scalar::Bool) => "bool".to_owned(),
+        Ty::Scalar(Scalar::Time) => "time".to_owned(),
+        Ty::Scalar(scalar) if scalar.is_real() => format!("f{}", scalar.bits()),
+        Ty::Scalar(scalar) if scalar.is_int() => {
+            format!("{}{}", if scalar.signed() { 'i' } else { 'u' }, scalar.bits())
+        }
+        Ty::Scalar(scalar) => format!("hex{}", scalar.bits()),
+        Ty::Enum(number) => {
+            let values = types
+                .enumerations
+                .get(*number)
+                .map(|e| e.values.as_slice())
+                .unwrap_or_default();
+            let values: Vec<String> = values.iter().map(|(name, value)| format!("{name}={value}")).collect();
+            format!("enum({})", values.join(","))
+        }
+        // Of arrays of structures the bytes are told: the variable that is looked for seldom lies there.
+        Ty::Array(array) if types.structure(&array.of).is_none() => {
+            let count: u64 = array.ranges.iter().map(|(_, count)| u64::from(*count)).product();
+            format!("{count}*{}", word(types, &array.of))
+        }
+        other => format!("{}*hex8", types.size(other)),
+    }
 }
 
 impl Leaves<'_> {
     fn leaf(&mut self, path: &str, ty: &Ty, offset: u32, life: Life) {
         let text = format!("{path}:{}", self.types.signature(ty));
         let size = self.types.size(ty);
+        let name = path.strip_prefix('.').unwrap_or(path);
+        self.form.push_str(&format!("{name}: {}\n", word(self.types, ty)));
         self.entries.push(Entry {
             word: (fnv(&text) & !0xffff) | u64::from(size & 0xffff),
             offset,
@@ -126,11 +161,12 @@ impl Layout {
             types: &checked.types,
             checked,
             entries: Vec::new(),
+            form: "packed 1\n".to_owned(),
         };
         leaves.leaf("#CLOCK", &Ty::Scalar(Scalar::Time), 0, Life::Always);
         leaves.leaf("#FLAG", &Ty::Scalar(Scalar::Byte), FLAG_AT, Life::Never);
         leaves.walk("", &Ty::Block(checked.program), HIDDEN, Life::SameName);
-        let entries = leaves.entries;
+        let Leaves { entries, form, .. } = leaves;
         let mut all = String::new();
         for entry in &entries {
             all.push_str(&format!("{:016x}", entry.word));
@@ -173,6 +209,7 @@ impl Layout {
             parameters,
             variables,
             name: name.len() as u32,
+            form,
         })
     }
 

@@ -8,4 +8,5 @@ mod errors;
 mod folding;
 mod language;
 mod library;
+mod lines;
 mod takeover;
