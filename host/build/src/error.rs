@@ -68,6 +68,14 @@ pub enum Error {
         /// Which.
         path: PathBuf,
     },
+    /// The system does not watch a folder.
+    #[error("{path} cannot be watched: {source}; \"no space\" means too many watched folders: sysctl fs.inotify.max_user_watches", path = path.display())]
+    Watch {
+        /// Which.
+        path: PathBuf,
+        /// What the system says.
+        source: io::Error,
+    },
     /// The SDK for Rust was not found.
     #[error("the folder guest-sdk of Bumpless was not found beside here or the program: name it with --sdk FOLDER")]
     NoSdk,

@@ -9,6 +9,7 @@
 mod cargo;
 mod error;
 mod project;
+mod state;
 mod watch;
 
 use std::{
@@ -19,6 +20,7 @@ use std::{
 pub use bumpless_st::Diagnostic;
 pub use error::Error;
 pub use project::{Language, create, sdk_near};
+pub use state::{Front, StateForm};
 pub use watch::Watch;
 
 /// A component that was built.
@@ -39,10 +41,29 @@ pub struct Built {
 /// # Errors
 /// [`Error::Text`] and [`Error::Program`] with what is wrong in the source; the others with the file.
 pub fn build(path: &Path, version: Option<&str>) -> Result<Built, Error> {
+    build_as(path, version, false)
+}
+
+/// As [`build`], with what says of each instruction which line it comes from. Such a component is for tools: the information may be
+/// many times as large as its code.
+///
+/// # Errors
+/// As [`build`].
+pub fn build_with_lines(path: &Path) -> Result<Built, Error> {
+    build_as(path, None, true)
+}
+
+fn build_as(path: &Path, version: Option<&str>, lines: bool) -> Result<Built, Error> {
     match source(path)? {
         Source::Text(file) => {
             let text = fs::read_to_string(&file).map_err(|source| Error::file(&file, "read", source))?;
-            let compiled = bumpless_st::compile_as(&text, version).map_err(|error| Error::Text {
+            let name = file.file_name().unwrap_or_default().to_string_lossy();
+            let compiled = if lines {
+                bumpless_st::compile_with_lines(&text, &name)
+            } else {
+                bumpless_st::compile_as(&text, version)
+            };
+            let compiled = compiled.map_err(|error| Error::Text {
                 path: file.clone(),
                 error,
             })?;
@@ -52,7 +73,7 @@ pub fn build(path: &Path, version: Option<&str>) -> Result<Built, Error> {
                 source: file,
             })
         }
-        Source::Crate(folder) => cargo::build(&folder, version),
+        Source::Crate(folder) => cargo::build(&folder, version, lines),
     }
 }
 
@@ -142,21 +163,5 @@ mod tests {
         ] {
             assert_eq!(create(Language::St, folder.path(), name, None).is_ok(), good, "{name}");
         }
-    }
-
-    #[test]
-    fn a_change_is_seen_once() {
-        let folder = tempfile::tempdir().unwrap();
-        let file = folder.path().join("a.st");
-        fs::write(&file, "one").unwrap();
-        let mut watch = Watch::new(folder.path());
-        assert!(!watch.changed());
-        fs::write(&file, "another").unwrap();
-        assert!(watch.changed());
-        assert!(!watch.changed());
-        fs::write(folder.path().join("notes.txt"), "x").unwrap();
-        assert!(!watch.changed());
-        fs::remove_file(&file).unwrap();
-        assert!(watch.changed());
     }
 }

@@ -18,16 +18,22 @@ pub enum Language {
     St,
 }
 
-const RUST: [(&str, &str); 4] = [
+const RUST: [(&str, &str); 7] = [
     ("Cargo.toml", include_str!("templates/Cargo.toml.txt")),
     ("src/lib.rs", include_str!("templates/lib.rs.txt")),
     ("experiment.toml", include_str!("templates/experiment.toml")),
+    ("host.toml", include_str!("templates/host.toml")),
+    ("loop.toml", include_str!("templates/loop.toml")),
+    (".gitignore", include_str!("templates/gitignore.txt")),
     ("README.md", include_str!("templates/rust.md")),
 ];
 
-const ST: [(&str, &str); 3] = [
+const ST: [(&str, &str); 6] = [
     ("NAME.st", include_str!("templates/loop.st")),
     ("experiment.toml", include_str!("templates/experiment.toml")),
+    ("host.toml", include_str!("templates/host.toml")),
+    ("loop.toml", include_str!("templates/loop.toml")),
+    (".gitignore", include_str!("templates/gitignore.txt")),
     ("README.md", include_str!("templates/st.md")),
 ];
 
@@ -69,6 +75,11 @@ pub fn create(language: Language, parent: &Path, name: &str, sdk: Option<&Path>)
             .replace("@WORD@", &word)
             .replace("@SDK@", &sdk.replace('\\', "\\\\"));
         fs::write(&path, text).map_err(|source| Error::file(&path, "written", source))?;
+    }
+    // The versions that the SDK is tested with: the project builds the same tomorrow, and without a network where they are here.
+    let (lock, own) = (Path::new(&sdk).join("../Cargo.lock"), folder.join("Cargo.lock"));
+    if language == Language::Rust && lock.is_file() {
+        fs::copy(&lock, &own).map_err(|source| Error::file(&own, "written", source))?;
     }
     Ok(folder)
 }
