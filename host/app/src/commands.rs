@@ -17,3 +17,4 @@ pub(crate) mod loops;
 pub(crate) mod past;
 pub(crate) mod point_lists;
 pub(crate) mod rollouts;
+pub(crate) mod step;

@@ -25,6 +25,7 @@ use crate::{
 pub(crate) use alarms::alarms;
 pub(crate) use dev::run as dev;
 use story::Story;
+pub(crate) use story::in_words;
 
 /// Follows a loop until the reader has seen enough.
 pub(crate) fn run(client: &Client, json: bool, args: &WatchArgs) -> Result<(), Error> {
@@ -35,6 +36,6 @@ pub(crate) fn run(client: &Client, json: bool, args: &WatchArgs) -> Result<(), E
     if json || args.plain || !std::io::stdout().is_terminal() {
         lines::run(&feed, story, json, args.cycles)
     } else {
-        screen::run(&feed, story, args.cycles)
+        screen::run(&feed, story, args.cycles, None)
     }
 }

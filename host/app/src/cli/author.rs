@@ -54,6 +54,9 @@ pub(crate) struct DevArgs {
     #[arg(long = "loop", value_name = "LOOP")]
     pub(crate) name: String,
     /// Stop after so many builds; failed where the last one did not come into force.
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     pub(crate) builds: Option<u32>,
+    /// Print lines instead of drawing; so it is too where the output is no terminal.
+    #[arg(long)]
+    pub(crate) plain: bool,
 }

@@ -11,7 +11,7 @@ use std::{
 use bumpless_api::types::Admission;
 use bumpless_build::{Built, Language};
 use bumpless_core::{HostId, PortKind, Verdict};
-use bumpless_engine::{Config as EngineConfig, Either, Engine};
+use bumpless_engine::{Config as EngineConfig, Either, Engine, Inspection};
 
 use super::library;
 use crate::{
@@ -63,6 +63,36 @@ pub(crate) fn build(args: &BuildArgs) -> Result<(), Error> {
     ))
 }
 
+/// Tries a component in this process as an upload would, and keeps nothing of it. None where it is a plant, which says itself.
+fn tried(bytes: &[u8], lines: bool) -> Result<Option<(Inspection, bumpless_core::Admission)>, Error> {
+    let config = EngineConfig {
+        instances_max: 8,
+        lines,
+        ..EngineConfig::default()
+    };
+    let engine = Engine::new(config).map_err(|e| Error::start("the sandbox", e))?;
+    let opened = engine.open_either(bytes).map_err(|error| Error::Failed {
+        what: "the check",
+        source: error.into(),
+    })?;
+    let (inspection, prepared) = match opened {
+        Either::Controller(inspection, prepared) => (inspection, prepared),
+        Either::Plant(plant, _) => {
+            let info = plant.info();
+            show::line(&format!(
+                "{}@{} is a plant; it is tried at its upload",
+                info.name, info.version
+            ))?;
+            return Ok(None);
+        }
+    };
+    let host = HostId::new("this-machine").map_err(|error| Error::start("the check", error))?;
+    let now = SystemTime::now().duration_since(UNIX_EPOCH);
+    let at_unix_ms = now.map_or(0, |since| u64::try_from(since.as_millis()).unwrap_or(u64::MAX));
+    let admission = bumpless_deploy::examined(&prepared, &inspection, host, at_unix_ms);
+    Ok(Some((inspection, admission)))
+}
+
 /// Builds where there is something to build, and tries what comes out as an upload would.
 pub(crate) fn check(json: bool, args: &CheckArgs) -> Result<(), Error> {
     let is_component = args.source.extension().is_some_and(|end| end == "wasm");
@@ -75,30 +105,18 @@ pub(crate) fn check(json: bool, args: &CheckArgs) -> Result<(), Error> {
     } else {
         bumpless_build::build(&args.source, None).map_err(failed)?.component
     };
-    // The author's own work: compiled in this process, and nothing is kept of it.
-    let config = EngineConfig {
-        instances_max: 8,
-        ..EngineConfig::default()
+    let Some((inspection, mut admission)) = tried(&bytes, false)? else {
+        return Ok(());
     };
-    let engine = Engine::new(config).map_err(|e| Error::start("the sandbox", e))?;
-    let opened = engine.open_either(&bytes).map_err(|error| Error::Failed {
-        what: "the check",
-        source: error.into(),
-    })?;
-    let (inspection, prepared) = match opened {
-        Either::Controller(inspection, prepared) => (inspection, prepared),
-        Either::Plant(plant, _) => {
-            return show::line(&format!(
-                "{}@{} is a plant; it is tried at its upload",
-                plant.info().name,
-                plant.info().version
-            ));
+    if admission.verdict == Verdict::Refused && !is_component {
+        // What a cell would take or refuse is without lines; whoever mends it needs them.
+        let with_lines = bumpless_build::build_with_lines(&args.source).map_err(failed)?;
+        if let Some((_, again)) = tried(&with_lines.component, true)?
+            && again.verdict == Verdict::Refused
+        {
+            admission.findings = again.findings;
         }
-    };
-    let host = HostId::new("this-machine").map_err(|error| Error::start("the check", error))?;
-    let now = SystemTime::now().duration_since(UNIX_EPOCH);
-    let at_unix_ms = now.map_or(0, |since| u64::try_from(since.as_millis()).unwrap_or(u64::MAX));
-    let admission = bumpless_deploy::examined(&prepared, &inspection, host, at_unix_ms);
+    }
     let refused = admission.verdict == Verdict::Refused;
     let report = Admission::from(admission);
     let d = &inspection.descriptor;
