@@ -97,6 +97,67 @@ fn a_law_in_structured_text_runs_a_loop_and_is_swapped_with_pid_without_a_bump()
     );
     let view = api.loop_view(&name).unwrap();
     assert!(view.to_string().contains("0.0.2"), "{view}");
+
+    // Its cycles one by one, by the names of the text; and the same steps again with the text as it is here.
+    let seq = view["seq"].as_u64().unwrap();
+    runs("cycles of the build", seq + 10);
+    let step = [
+        "loop",
+        "step",
+        &name,
+        "--last",
+        "4",
+        "--count",
+        "2",
+        "--api",
+        api.base(),
+    ];
+    let told = bumpless(folder.path(), &step);
+    for part in [
+        "pressure-law@0.0.2",
+        "PV  ",
+        "INTEGRAL  ",
+        "state before → after",
+        "sent ",
+    ] {
+        let text = said(&told);
+        assert!(text.to_uppercase().contains(&part.to_uppercase()), "{part}: {text}");
+    }
+    let again = bumpless(folder.path(), &[&step[..], &["--with", "law.st"]].concat());
+    assert!(said(&again).contains("as recorded"), "{}", said(&again));
+    fs::write(
+        folder.path().join("endless.st"),
+        LAW.replace(
+            "out := integral + k * e;\n",
+            "WHILE TRUE DO\n    out := 0.0;\nEND_WHILE;\n",
+        ),
+    )
+    .unwrap();
+    let endless = bumpless(folder.path(), &[&step[..], &["--with", "endless.st"]].concat());
+    assert!(
+        said(&endless).contains("it was in PRESSURE_LAW (endless.st:1"),
+        "{}",
+        said(&endless)
+    );
+}
+
+#[test]
+fn a_law_in_rust_that_traps_names_its_line() {
+    let folder = tempfile::tempdir().unwrap();
+    let made = bumpless(folder.path(), &["new", "rust", "speed"]);
+    assert!(made.status.success(), "{}", said(&made));
+    let law = folder.path().join("speed/src/lib.rs");
+    let source = fs::read_to_string(&law).unwrap();
+    let wrong = source.replace(
+        "        let error = cycle.setpoint",
+        "        assert!(cycle.dt_s() < 0.0, \"time goes on\");\n        let error = cycle.setpoint",
+    );
+    let line = wrong.lines().position(|line| line.contains("time goes on")).unwrap() + 1;
+    fs::write(&law, wrong).unwrap();
+    let refused = bumpless(folder.path(), &["check", "speed"]);
+    assert_eq!(refused.status.code(), Some(1), "{}", said(&refused));
+    let place = format!("src/lib.rs:{line})");
+    assert!(said(&refused).contains(&place), "{place}: {}", said(&refused));
 }
 
 #[test]
