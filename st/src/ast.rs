@@ -193,8 +193,10 @@ pub(crate) enum BlockKind {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Retain {
     Usual,
-    Retain,
-    NonRetain,
+    /// RETAIN.
+    Always,
+    /// NON_RETAIN.
+    Never,
 }
 
 #[derive(Debug, Clone)]

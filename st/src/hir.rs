@@ -142,6 +142,9 @@ pub(crate) enum Argument {
     Address(Place),
 }
 
+/// Of a CASE: ranges of labels, and what is done for them.
+pub(crate) type Branch = (Vec<(i64, i64)>, Vec<Stmt>);
+
 #[derive(Debug, Clone)]
 pub(crate) enum Stmt {
     /// What follows stands here in the text, in bytes.
@@ -163,7 +166,7 @@ pub(crate) enum Stmt {
     Call(Expr, Vec<(Place, Expr)>),
     If(Vec<(Expr, Vec<Stmt>)>, Vec<Stmt>),
     /// Selector (LINT), ranges of labels.
-    Case(Expr, Vec<(Vec<(i64, i64)>, Vec<Stmt>)>, Vec<Stmt>),
+    Case(Expr, Vec<Branch>, Vec<Stmt>),
     /// Variable, first, last and step, all LINT; by how much is known to go up, down, or only in the cycle.
     For {
         variable: Place,

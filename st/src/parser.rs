@@ -355,11 +355,8 @@ impl Parser<'_> {
                 sink: self.sink,
                 depth: self.depth,
             };
-            loop {
-                match parser.attribute() {
-                    Ok(attribute) => attributes.push(attribute),
-                    Err(Slip) => break,
-                }
+            while let Ok(attribute) = parser.attribute() {
+                attributes.push(attribute);
                 if !(parser.take_symbol(",") || parser.take_symbol(";")) {
                     if !parser.at_end() {
                         parser.expected("`,`");
@@ -393,9 +390,9 @@ impl Parser<'_> {
             if self.take_word("CONSTANT") {
                 constant = true;
             } else if self.take_word("RETAIN") || self.take_word("PERSISTENT") {
-                retain = Retain::Retain;
+                retain = Retain::Always;
             } else if self.take_word("NON_RETAIN") {
-                retain = Retain::NonRetain;
+                retain = Retain::Never;
             } else {
                 break;
             }

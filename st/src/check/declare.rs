@@ -401,7 +401,7 @@ impl<'a> Layout<'a> {
         let is_function = self.ast.kind == PouKind::Function;
         let is_program = self.ast.kind == PouKind::Program;
         let is_port = is_program && matches!(block.kind, BlockKind::Input | BlockKind::Output);
-        if !declaration.attributes.is_empty() && !is_port && !(is_program && block.constant) {
+        if !(declaration.attributes.is_empty() || is_port || is_program && block.constant) {
             let span = declaration.attributes.first().map_or(name.span, |a| a.span);
             checker.error(span, "attributes belong to ports and to constants of the PROGRAM");
         }

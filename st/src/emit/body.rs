@@ -7,7 +7,7 @@ use wasm_encoder::{Instruction as I, ValType};
 
 use super::{Code, Global, Plan, is_function, val_type};
 use crate::{
-    hir::{Argument, Base, Expr, External, Input, Kind, Place, Stmt},
+    hir::{Argument, Base, Branch, Expr, External, Input, Kind, Place, Stmt},
     types::{Scalar, Ty},
 };
 
@@ -344,7 +344,7 @@ impl Writer<'_, '_> {
         self.code.branch_if(exit);
     }
 
-    fn case(&mut self, selector: &Expr, cases: &[(Vec<(i64, i64)>, Vec<Stmt>)], otherwise: &[Stmt]) {
+    fn case(&mut self, selector: &Expr, cases: &[Branch], otherwise: &[Stmt]) {
         let chosen = self.code.local(ValType::I64);
         self.expression(selector);
         self.code.set(chosen);

@@ -141,8 +141,8 @@ impl Leaves<'_> {
         for (n, field) in structure.fields.iter().enumerate() {
             let own = match retains.and_then(|retains| retains.get(n)) {
                 _ if life == Life::Never => Life::Never,
-                Some(Retain::Retain) => Life::Always,
-                Some(Retain::NonRetain) => Life::Never,
+                Some(Retain::Always) => Life::Always,
+                Some(Retain::Never) => Life::Never,
                 _ => life,
             };
             self.walk(&format!("{path}.{}", field.name), &field.ty, offset + field.offset, own);
