@@ -100,7 +100,7 @@ fn known(client: &Client, records: &[Record]) -> BTreeMap<String, Option<Known>>
     for record in records {
         known.entry(record.digest.clone()).or_insert_with(|| {
             let address = format!("/v1/components/{}", encoded(&record.digest));
-            let component: Component = client.get(&address).and_then(|answer| answer.decode()).ok()?;
+            let component: Component = client.get(&address).ok()?.decode().ok()?;
             let bytes = client.bytes(&format!("{address}/bytes"), COMPONENT_BYTES_MAX as u64 + 1);
             let form = bytes.ok().as_deref().and_then(StateForm::of_component);
             Some(Known { component, form })
