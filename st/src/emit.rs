@@ -14,7 +14,7 @@
 //! Never: finds anything wrong with a text; only a state that is too large is said here.
 
 mod body;
-mod helpers;
+mod fixed;
 mod lines;
 mod operation;
 mod state;
@@ -293,7 +293,7 @@ impl Functions {
 #[derive(Debug)]
 struct Plan<'a> {
     checked: &'a Checked<'a>,
-    helpers: helpers::Helpers,
+    fixed: fixed::Fixed,
     /// Numbers of the functions of POUs; none where one is not reached.
     pous: Vec<Option<u32>>,
     /// Address of the first values of all frames.
@@ -313,7 +313,7 @@ pub(crate) fn emit(checked: &Checked<'_>, text: Option<Text<'_>>) -> Result<(Vec
     data.bytes.truncate((frames - DATA_AT) as usize);
 
     let mut functions = Functions::default();
-    let helpers = helpers::Helpers::add(&mut functions, heap);
+    let fixed = fixed::Fixed::add(&mut functions, heap);
     let first = IMPORTS + functions.codes.len() as u32;
     let reached = checked.pous.iter().scan(first, |next, pou| {
         Some(pou.body.as_ref().map(|_| {
@@ -323,7 +323,7 @@ pub(crate) fn emit(checked: &Checked<'_>, text: Option<Text<'_>>) -> Result<(Vec
     });
     let plan = Plan {
         checked,
-        helpers,
+        fixed,
         pous: reached.collect(),
         templates,
         frames,

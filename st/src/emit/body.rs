@@ -112,7 +112,7 @@ impl Writer<'_, '_> {
             self.code.push(I::I64Const(index.low));
             self.code.int(index.count);
             self.code.int(index.site);
-            self.code.push(I::Call(self.plan.helpers.index));
+            self.code.push(I::Call(self.plan.fixed.index));
             self.code.int(index.stride);
             self.code.all([I::I32Mul, I::I32Add]);
         }
@@ -161,7 +161,7 @@ impl Writer<'_, '_> {
             Kind::Two(op, operands, left, right) => {
                 self.expression(left);
                 self.expression(right);
-                self.code.two(*op, *operands, &self.plan.helpers);
+                self.code.two(*op, *operands, &self.plan.fixed);
             }
             Kind::Convert(inner, from, to) => {
                 self.expression(inner);

@@ -5,7 +5,7 @@
 
 use wasm_encoder::{Instruction as I, ValType};
 
-use super::{Code, helpers::Helpers, val_type};
+use super::{Code, fixed::Fixed, val_type};
 use crate::{
     hir::{One, Op, Value},
     types::Scalar,
@@ -150,23 +150,23 @@ impl Code {
     }
 
     /// Two operands, which lie on the stack.
-    pub(super) fn two(&mut self, op: Op, scalar: Scalar, helpers: &Helpers) {
+    pub(super) fn two(&mut self, op: Op, scalar: Scalar, fixed: &Fixed) {
         match val_type(scalar) {
-            ValType::F32 => self.two_f32(op, helpers),
-            ValType::F64 => self.two_f64(op, helpers),
-            ValType::I64 => self.two_i64(op, scalar, helpers),
-            _ => self.two_i32(op, scalar, helpers),
+            ValType::F32 => self.two_f32(op, fixed),
+            ValType::F64 => self.two_f64(op, fixed),
+            ValType::I64 => self.two_i64(op, scalar, fixed),
+            _ => self.two_i32(op, scalar, fixed),
         }
     }
 
-    fn two_f32(&mut self, op: Op, helpers: &Helpers) {
+    fn two_f32(&mut self, op: Op, fixed: &Fixed) {
         let instruction = match op {
             Op::Add => I::F32Add,
             Op::Sub => I::F32Sub,
             Op::Mul => I::F32Mul,
             Op::Div(site) | Op::Mod(site) => {
                 self.push(I::I32Const(site as i32));
-                return self.push(I::Call(helpers.div_f32));
+                return self.push(I::Call(fixed.div_f32));
             }
             Op::Ne => I::F32Ne,
             Op::Lt => I::F32Lt,
@@ -180,14 +180,14 @@ impl Code {
         self.push(instruction);
     }
 
-    fn two_f64(&mut self, op: Op, helpers: &Helpers) {
+    fn two_f64(&mut self, op: Op, fixed: &Fixed) {
         let instruction = match op {
             Op::Add => I::F64Add,
             Op::Sub => I::F64Sub,
             Op::Mul => I::F64Mul,
             Op::Div(site) | Op::Mod(site) => {
                 self.push(I::I32Const(site as i32));
-                return self.push(I::Call(helpers.div_f64));
+                return self.push(I::Call(fixed.div_f64));
             }
             Op::Ne => I::F64Ne,
             Op::Lt => I::F64Lt,
@@ -201,17 +201,17 @@ impl Code {
         self.push(instruction);
     }
 
-    fn two_i64(&mut self, op: Op, scalar: Scalar, helpers: &Helpers) {
+    fn two_i64(&mut self, op: Op, scalar: Scalar, fixed: &Fixed) {
         let signed = scalar.signed();
         let or = |a, b| if signed { a } else { b };
         match op {
             Op::Div(site) => {
                 self.int(site);
-                self.push(I::Call(or(helpers.div_s64, helpers.div_u64)));
+                self.push(I::Call(or(fixed.div_s64, fixed.div_u64)));
             }
             Op::Mod(site) => {
                 self.int(site);
-                self.push(I::Call(or(helpers.rem_s64, helpers.rem_u64)));
+                self.push(I::Call(or(fixed.rem_s64, fixed.rem_u64)));
             }
             Op::Min | Op::Max => {
                 let (a, b) = (self.local(ValType::I64), self.local(ValType::I64));
@@ -250,18 +250,18 @@ impl Code {
         }
     }
 
-    fn two_i32(&mut self, op: Op, scalar: Scalar, helpers: &Helpers) {
+    fn two_i32(&mut self, op: Op, scalar: Scalar, fixed: &Fixed) {
         let signed = scalar.signed();
         let or = |a, b| if signed { a } else { b };
         let bits = scalar.bits() as i32;
         match op {
             Op::Div(site) => {
                 self.int(site);
-                self.push(I::Call(or(helpers.div_s32, helpers.div_u32)));
+                self.push(I::Call(or(fixed.div_s32, fixed.div_u32)));
             }
             Op::Mod(site) => {
                 self.int(site);
-                self.push(I::Call(or(helpers.rem_s32, helpers.rem_u32)));
+                self.push(I::Call(or(fixed.rem_s32, fixed.rem_u32)));
             }
             Op::Min | Op::Max => {
                 let (a, b) = (self.local(ValType::I32), self.local(ValType::I32));

@@ -123,7 +123,7 @@ impl World<'_> {
         code.int(case);
         code.int(both as u32);
         code.int((both >> 32) as u32);
-        code.all([I::Call(self.plan.helpers.err), I::Return]);
+        code.all([I::Call(self.plan.fixed.err), I::Return]);
     }
 
     fn text(&self, number: usize) -> [u8; 8] {
@@ -165,7 +165,7 @@ impl World<'_> {
     fn fresh(&self, code: &mut Code, made: u32, parameters: u32) {
         let bytes = self.layout.bytes() as u32;
         code.int(bytes);
-        code.all([I::Call(self.plan.helpers.alloc), I::LocalTee(made)]);
+        code.all([I::Call(self.plan.fixed.alloc), I::LocalTee(made)]);
         code.int(self.tables.template);
         code.int(bytes);
         code.copy();
@@ -197,7 +197,7 @@ impl World<'_> {
     fn good(&self, code: &mut Code, state: u32) {
         code.get(state);
         code.int(self.layout.bytes() as u32);
-        code.push(I::Call(self.plan.helpers.ok));
+        code.push(I::Call(self.plan.fixed.ok));
     }
 
     /// `(parameters, count, track, count)`.
@@ -226,7 +226,7 @@ impl World<'_> {
         code.get(state);
         code.int(self.tables.template);
         code.int(self.layout.parameters);
-        code.all([I::Call(self.plan.helpers.same), I::I32Eqz]);
+        code.all([I::Call(self.plan.fixed.same), I::I32Eqz]);
         code.when();
         self.fail(&mut code, 1, self.text(BAD_STATE));
         code.end();
@@ -282,7 +282,7 @@ impl World<'_> {
             // Faults are numbered from 1.
             code.push(I::I32Load(at(self.tables.sites.wrapping_sub(8) + word)));
         }
-        code.all([I::Call(self.plan.helpers.err), I::Return]);
+        code.all([I::Call(self.plan.fixed.err), I::Return]);
         code.end();
         self.outputs(&mut code, state);
         self.good(&mut code, state);
@@ -452,7 +452,7 @@ impl World<'_> {
         code.all([I::LocalGet(state), I::I32Const(2), I::I32Add]);
         code.int(self.tables.template + 2);
         code.int(self.layout.name);
-        code.all([I::Call(self.plan.helpers.same), I::LocalSet(same)]);
+        code.all([I::Call(self.plan.fixed.same), I::LocalSet(same)]);
         code.end();
 
         self.fresh(&mut code, made, parameters);

@@ -1,4 +1,4 @@
-//! Functions that every module has: memory for the host, division, indices, the first fault of a call.
+//! The fixed part of every module, functions that each has: memory for the host, division, indices, the first fault of a call.
 //!
 //! A fault does not trap: the first one is kept, loops end at it, and the step returns it in words instead of effects.
 //! Never: anything that depends on a text.
@@ -9,7 +9,7 @@ use super::{Code, Functions, Global, PAGE, RESULT_AT, at};
 
 /// Their numbers.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Helpers {
+pub(super) struct Fixed {
     pub(super) alloc: u32,
     pub(super) index: u32,
     pub(super) div_s32: u32,
@@ -33,7 +33,7 @@ pub(super) struct Helpers {
 const I32: ValType = ValType::I32;
 const I64: ValType = ValType::I64;
 
-impl Helpers {
+impl Fixed {
     pub(super) fn add(functions: &mut Functions, heap: u32) -> Self {
         let alloc = functions.add("allocate", allocate());
         functions.export("cabi_realloc", "cabi_realloc", reallocate(alloc));
