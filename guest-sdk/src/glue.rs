@@ -12,6 +12,21 @@ use crate::{
     io::Host,
 };
 
+/// The bytes of a text as an array, while compiling.
+#[must_use]
+#[allow(
+    clippy::indexing_slicing,
+    reason = "both are looked at before; slices have no `get` while compiling"
+)]
+pub const fn bytes_of<const N: usize>(text: &str) -> [u8; N] {
+    let (from, mut bytes, mut at) = (text.as_bytes(), [0; N], 0);
+    while at < N && at < from.len() {
+        bytes[at] = from[at];
+        at += 1;
+    }
+    bytes
+}
+
 /// Gives a [`Controller`] the exports of the world.
 #[derive(Debug)]
 pub struct Glue<C>(PhantomData<C>);

@@ -120,6 +120,28 @@ macro_rules! export {
     };
 }
 
+/// Says what a controller's state consists of, for those who look at one: `bumpless loop step` then shows it by name. One text per
+/// value, in the order of the type's fields: `"name: type"`, where a type is `bool`, `u8` to `u64`, `i8` to `i64`, `f32`, `f64`,
+/// `text` (a `String`), `hex8` (a `u8` of bits), `option<T>`, `seq<T>` (a `Vec`), `3*T` (an array), `(T, T)` (a tuple, or a structure
+/// within), `enum(a,b)` (without payloads). The text goes into a custom section of the component and costs nothing at run time.
+///
+/// ```
+/// bumpless_sdk::state_form!("integral: f64", "last: option<f64>");
+/// ```
+#[macro_export]
+macro_rules! state_form {
+    ($($value:literal),+ $(,)?) => {
+        #[cfg(target_arch = "wasm32")]
+        #[allow(unsafe_code, reason = "a section of a component is named; nothing reads or writes it as memory")]
+        const _: () = {
+            const TEXT: &str = concat!("postcard 1\n", $($value, "\n"),+);
+            #[used]
+            #[unsafe(link_section = "bumpless:state")]
+            static SECTION: [u8; TEXT.len()] = $crate::glue::bytes_of(TEXT);
+        };
+    };
+}
+
 /// Makes an implementation of the generated `Guest` trait the component of this crate, without any check.
 #[doc(hidden)]
 #[macro_export]

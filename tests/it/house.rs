@@ -55,8 +55,11 @@ const ROOMS: [(&str, &[&str]); 38] = [
             "bumpless-lab",
             "bumpless-scada",
             "bumpless-telemetry",
+            "bumpless-build",
         ],
     ),
+    ("bumpless-build", &["bumpless-st"]),
+    ("bumpless-st", &[]),
     ("bumpless-telemetry", &[]),
     ("bumpless-sdk", &[]),
     ("bumpless-isa", &["bumpless-sdk"]),
@@ -122,13 +125,14 @@ const CONFINED: [(&str, &[&str]); 14] = [
 /// Where a host's program reads the date: once at its start, for what people read; for entries and figures that people and their
 /// programs read; to say that the clock is off; and in the command line's own answers. A date that is set while hosts run can
 /// matter nowhere else.
-const DATES: [&str; 8] = [
+const DATES: [&str; 9] = [
     "host/io/src/clock.rs",
     "host/api/src/routes/audit.rs",
     "host/deploy/src/audit.rs",
     "host/deploy/src/self_watch.rs",
     "host/telemetry/src/metrics.rs",
     "host/api/src/notices.rs",
+    "host/app/src/commands/author.rs",
     "host/app/src/commands/components.rs",
     "host/app/src/commands/io.rs",
 ];

@@ -30,6 +30,7 @@
 //! | watching | metrics, the document of the API, the live feed |
 //! | library | trials, labels, bundles, bombs and crowds of components |
 //! | stock | every stock law passes its trial |
+//! | authors | a law in Structured Text from its project to a running loop, and back to `pid` |
 //! | lab | virtual time against a live cell, and the ways between the two; plants as components |
 //! | guides | the commands in the documentation |
 //! | house | the rules of the source itself |
@@ -44,6 +45,7 @@
 mod alarms;
 mod api;
 mod audit;
+mod authors;
 mod calls;
 mod changes;
 mod chaos;

@@ -96,6 +96,7 @@ impl Controller for OnOff {
 }
 
 bumpless_sdk::export!(OnOff);
+bumpless_sdk::state_form!("on: bool", "since-s: f64", "settled: bool");
 
 #[cfg(test)]
 mod tests {

@@ -38,3 +38,18 @@ impl Controller for Pid {
 }
 
 bumpless_sdk::export!(Pid);
+bumpless_sdk::state_form!(
+    "phase: enum(new,following,running,bypassed)",
+    "output: f64",
+    "integral: f64",
+    "pv: f64",
+    "setpoint: f64",
+    "feedforward: f64",
+    "derivative: f64",
+    "derivative-setpoint: f64",
+    "waited-s: f64",
+    "remote: bool",
+    "alarms: hex8",
+    "below: option<(f64, hex8, u8)>",
+    "limits: hex8",
+);

@@ -9,6 +9,7 @@ use clap_complete::Shell;
 
 mod alarm;
 mod audit;
+mod author;
 mod cell;
 mod history;
 pub(crate) mod io;
@@ -20,6 +21,7 @@ mod rollout;
 
 pub(crate) use alarm::{AlarmCommand, Of as AlarmOf};
 pub(crate) use audit::{AuditCommand, Format as AuditFormat, ListArgs as AuditListArgs, Noted};
+pub(crate) use author::{BuildArgs, CheckArgs, DevArgs, LanguageWord, NewArgs};
 pub(crate) use cell::HostsCommand;
 pub(crate) use history::HistoryCommand;
 pub(crate) use lab::{LabArgs, LabCommand, LabRunArgs};
@@ -72,6 +74,14 @@ pub(crate) enum Command {
     Host(HostArgs),
     /// Start a whole cell on this machine: a simulated plant, three controller hosts, one running loop.
     Demo(DemoArgs),
+    /// Begin a controller: a project with a law, a test on a simulated plant, and a README.
+    New(NewArgs),
+    /// Build a controller from Structured Text or Rust.
+    Build(BuildArgs),
+    /// Say of a controller what a cell would: world, imports, description, statelessness, step times.
+    Check(CheckArgs),
+    /// Build at each save, swap into a running loop, show its cycles.
+    Dev(DevArgs),
     /// Upload a component (a .wasm file) or a script (.lua) to the cell's library.
     Upload(UploadArgs),
     /// The library: list, show, label, download, export, import, delete.
@@ -359,6 +369,10 @@ pub fn run(cli: Cli) -> Result<(), Error> {
     match cli.command {
         Command::Host(args) => host::run(&args),
         Command::Demo(args) => demo::run(&args),
+        Command::New(args) => commands::author::new(&args),
+        Command::Build(args) => commands::author::build(&args),
+        Command::Check(args) => commands::author::check(json, &args),
+        Command::Dev(args) => watch::dev(&client()?, &args),
         Command::Upload(args) => commands::components::upload(&client()?, json, &args),
         Command::Components(ComponentsArgs { filter, what }) => {
             commands::components::run(&client()?, json, what.unwrap_or(ComponentsCommand::List(filter)))
@@ -406,6 +420,11 @@ mod tests {
         let parse = |text: &str| Cli::try_parse_from(text.split(' '));
         for good in [
             "bumpless host --config host.toml --data /tmp/x --check",
+            "bumpless new st level",
+            "bumpless new rust level --sdk ../guest-sdk",
+            "bumpless build level.st -o level.wasm",
+            "bumpless check level",
+            "bumpless dev level --loop pressure",
             "bumpless upload pid.wasm --note x --json",
             "bumpless upload pid.wasm --label stage=pilot --label line=3 --force --wait",
             "bumpless upload pid.wasm --dry-run",
@@ -499,6 +518,8 @@ mod tests {
         }
         for (bad, part) in [
             ("bumpless host", "--config"),
+            ("bumpless new cobol level", "[possible values: rust, st]"),
+            ("bumpless dev level", "--loop <LOOP>"),
             ("bumpless upload pid.wasm --dry-run --force", "cannot be used with"),
             ("bumpless components label pid", "<KEY=VALUE|KEY->"),
             ("bumpless components label pid stage", "KEY- to remove it"),

@@ -4,6 +4,7 @@
 
 pub(crate) mod alarms;
 pub(crate) mod audit;
+pub(crate) mod author;
 pub(crate) mod components;
 pub(crate) mod curves;
 pub(crate) mod history;
@@ -17,3 +18,4 @@ pub(crate) mod past;
 pub(crate) mod point_lists;
 pub(crate) mod programs;
 pub(crate) mod rollouts;
+pub(crate) mod step;

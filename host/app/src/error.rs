@@ -77,6 +77,9 @@ pub enum Error {
         /// What about it.
         reason: String,
     },
+    /// A source that does not build; the message names its places.
+    #[error("{0}")]
+    Build(Box<bumpless_build::Error>),
     /// What was typed cannot be meant.
     #[error("{0}")]
     Usage(String),

@@ -7,6 +7,7 @@
 //! Never: disturbs the loop; whoever watches too slowly is told how many records were lost.
 
 mod alarms;
+mod dev;
 mod feed;
 mod lines;
 mod screen;
@@ -22,7 +23,9 @@ use crate::{
     error::Error,
 };
 pub(crate) use alarms::alarms;
+pub(crate) use dev::run as dev;
 use story::Story;
+pub(crate) use story::in_words;
 
 /// Follows a loop until the reader has seen enough.
 pub(crate) fn run(client: &Client, json: bool, args: &WatchArgs) -> Result<(), Error> {
@@ -33,6 +36,6 @@ pub(crate) fn run(client: &Client, json: bool, args: &WatchArgs) -> Result<(), E
     if json || args.plain || !std::io::stdout().is_terminal() {
         lines::run(&feed, story, json, args.cycles)
     } else {
-        screen::run(&feed, story, args.cycles)
+        screen::run(&feed, story, args.cycles, None)
     }
 }

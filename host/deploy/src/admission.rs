@@ -31,7 +31,7 @@ use std::{sync::Arc, time::Duration};
 use bumpless_core::{
     Admission, ComponentInfo, Finding, Fit, HostId, LoopSpec, Severity, Verdict, admission::FINDINGS_MAX,
 };
-use bumpless_engine::{INTERFACES, Prepared, PreparedPlant};
+use bumpless_engine::{INTERFACES, Inspection, Prepared, PreparedPlant};
 use tokio::{sync::oneshot, time::timeout};
 
 use crate::{
@@ -92,6 +92,19 @@ impl Room {
             self.clock.unix_ms(),
         ))
     }
+}
+
+/// Tries a component as its upload would, outside of any cell: for its author. Blocks for as long as a trial lasts, and needs
+/// 1 MiB of stack. `host` is who the report says that tried it, `at_unix_ms` when.
+#[must_use]
+pub fn examined(prepared: &Arc<Prepared>, inspection: &Inspection, host: HostId, at_unix_ms: u64) -> Admission {
+    report(
+        &trial::run(prepared),
+        host,
+        &inspection.imports,
+        inspection.compile_time,
+        at_unix_ms,
+    )
 }
 
 /// Runs work on a thread of its own that any other work may hold up.

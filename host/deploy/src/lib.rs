@@ -75,6 +75,7 @@ pub mod view;
 /// The target of the spans that say how long the parts of a change take. They are for a collector; see `bumpless-telemetry`.
 pub const SPANS: &str = "bumpless::spans";
 
+pub use admission::examined;
 pub use bumpless_cell::Knock;
 pub use bumpless_store::Window;
 pub use deploy::Deploy;

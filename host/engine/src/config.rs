@@ -73,6 +73,10 @@ pub struct Config {
     pub compile: Compile,
     /// Bounds.
     pub limits: Limits,
+    /// Shall faults name files and lines, where a component brings debug information? For an author's tools, never for a host:
+    /// that information comes from outside, and reading it takes milliseconds on the thread that stepped. Needs
+    /// [`Compile::InProcess`].
+    pub lines: bool,
 }
 
 impl Default for Config {
@@ -84,6 +88,7 @@ impl Default for Config {
             instances_max: 1000,
             compile: Compile::InProcess,
             limits: Limits::default(),
+            lines: false,
         }
     }
 }
@@ -96,6 +101,7 @@ impl std::fmt::Debug for Config {
             .field("instances_max", &self.instances_max)
             .field("compile", &self.compile)
             .field("limits", &self.limits)
+            .field("lines", &self.lines)
             .finish_non_exhaustive()
     }
 }

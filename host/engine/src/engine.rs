@@ -70,14 +70,15 @@ impl Engine {
             instances_max,
             compile,
             limits,
+            lines,
         } = config;
         let mut profile = Profile::choose(instances_max, &limits, Maps::read())?;
-        let engine = match profile.runtime(instances_max, &limits) {
+        let engine = match profile.runtime(instances_max, &limits, lines) {
             Err(error) if profile == Profile::Pooled => {
                 // For example under a limit on address space.
                 tracing::warn!(%error, "slots for {instances_max} instances cannot be reserved; allocating on demand");
                 profile = Profile::OnDemand;
-                profile.runtime(instances_max, &limits)?
+                profile.runtime(instances_max, &limits, lines)?
             }
             other => other?,
         };
@@ -324,6 +325,13 @@ fn check(config: &Config) -> Result<(), Error> {
             "memory_bytes_max",
             memory as u64,
             "use a multiple of 65,536 up to 4 GiB",
+        );
+    }
+    if config.lines && (config.cache_dir.is_some() || !matches!(config.compile, Compile::InProcess)) {
+        return wrong(
+            "lines",
+            1,
+            "it is for tools: compile in this process, and keep nothing on disk",
         );
     }
     if config.limits.prepared_max == 0 {

@@ -18,7 +18,7 @@ use crate::{
     Prepared,
     bindings::bumpless::control::types,
     capacity::Place,
-    convert,
+    convert, place,
     prepared::Live,
     sandbox::{Call, Sandbox},
     ticker::monotonic_ns,
@@ -45,6 +45,7 @@ pub struct Instance {
     live: Option<Live>,
     prepared: Arc<Prepared>,
     last_step_ns: u64,
+    stopped_in: Option<String>,
     _place: Place,
 }
 
@@ -54,6 +55,7 @@ impl Instance {
             live: Some(live),
             prepared,
             last_step_ns: 0,
+            stopped_in: None,
             _place: place,
         }
     }
@@ -68,6 +70,13 @@ impl Instance {
     #[must_use]
     pub const fn last_step_ns(&self) -> u64 {
         self.last_step_ns
+    }
+
+    /// Where the guest was when a trap or a limit last ended its life: a function, with file and line under
+    /// [`Config::lines`](crate::Config::lines). None where that never happened, or nothing is known of the place.
+    #[must_use]
+    pub fn stopped_in(&self) -> Option<&str> {
+        self.stopped_in.as_deref()
     }
 
     /// Linear memory that the guest has, in bytes; 0 where its life has ended.
@@ -162,6 +171,7 @@ impl Instance {
             Ok(Err(said)) => Err(convert::fault(&said)),
             Err(error) => {
                 let fault = live.store.data().fault(&error, limit_ns);
+                self.stopped_in = place::of(&error);
                 // wasmtime lets nobody into a store that has trapped, and a half-run guest must not go on anyway.
                 self.live = None;
                 Err(fault)

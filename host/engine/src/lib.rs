@@ -30,6 +30,7 @@ mod engine;
 mod error;
 mod imports;
 mod instance;
+mod place;
 mod plant;
 mod plant_bindings;
 mod prepared;

@@ -5,7 +5,7 @@
 
 use std::num::NonZeroUsize;
 
-use wasmtime::{Config, InstanceAllocationStrategy, PoolingAllocationConfig};
+use wasmtime::{Config, InstanceAllocationStrategy, PoolingAllocationConfig, WasmBacktraceDetails};
 
 use crate::{
     Error,
@@ -102,7 +102,7 @@ impl Profile {
     }
 
     /// Settings that decide about the code: the same in the host and in the compiling child.
-    fn code_settings(self, limits: &Limits) -> Config {
+    fn code_settings(self, limits: &Limits, lines: bool) -> Config {
         let mut config = Config::new();
         config
             // Deadlines: epochs, which cost less than fuel and need no accounting per instruction.
@@ -122,7 +122,13 @@ impl Profile {
             .memory_init_cow(false)
             // The name of the first guest function is enough for a fault's text.
             .wasm_backtrace_max_frames(NonZeroUsize::new(8))
-            .generate_address_map(false)
+            .generate_address_map(lines)
+            // Said, because the default asks the environment.
+            .wasm_backtrace_details(if lines {
+                WasmBacktraceDetails::Enable
+            } else {
+                WasmBacktraceDetails::Disable
+            })
             .guard_before_linear_memory(false);
         match self {
             // The base of a memory never moves. Accesses are checked against its size; reserving 4 GiB a piece would
@@ -153,14 +159,14 @@ impl Profile {
 
     /// An engine that only compiles, with as many threads as [`compile_threads`] allows.
     pub(crate) fn compiler(self, limits: &Limits) -> Result<wasmtime::Engine, Error> {
-        let mut config = self.code_settings(limits);
+        let mut config = self.code_settings(limits, false);
         config.parallel_compilation(compile_threads() > 1);
         engine(&config)
     }
 
-    /// An engine that runs.
-    pub(crate) fn runtime(self, instances_max: u32, limits: &Limits) -> Result<wasmtime::Engine, Error> {
-        let mut config = self.code_settings(limits);
+    /// An engine that runs; with `lines` as [`Config::lines`](crate::Config::lines) says.
+    pub(crate) fn runtime(self, instances_max: u32, limits: &Limits, lines: bool) -> Result<wasmtime::Engine, Error> {
+        let mut config = self.code_settings(limits, lines);
         // Where the host itself compiles it leaves the other cores to the cycles.
         config.parallel_compilation(false);
         if self == Self::Pooled {

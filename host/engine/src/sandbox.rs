@@ -17,9 +17,9 @@ use bumpless_core::{
     limits::{LOG_LINES_PER_STEP_MAX, PORTS_MAX, TEXT_CHARS_MAX},
 };
 use rustix::time::{ClockId, clock_gettime};
-use wasmtime::{ResourceLimiter, Trap, WasmBacktrace};
+use wasmtime::{ResourceLimiter, Trap};
 
-use crate::{config::Limits, ticker::monotonic_ns};
+use crate::{config::Limits, place, ticker::monotonic_ns};
 
 /// Core instances, memories and tables of one component. A Rust component has 3, 1 and 2; composed ones have more.
 pub(crate) const CORE_INSTANCES_MAX: usize = 8;
@@ -270,11 +270,7 @@ impl Sandbox {
         }
         let cause = trap.map_or(root, ToString::to_string);
         let cause = cause.strip_prefix("wasm trap: ").unwrap_or(&cause);
-        let place = error
-            .downcast_ref::<WasmBacktrace>()
-            .and_then(|trace| trace.frames().iter().find_map(wasmtime::FrameInfo::func_name))
-            .map(|name| format!(" in {name}"))
-            .unwrap_or_default();
+        let place = place::of(error).map(|place| format!(" in {place}")).unwrap_or_default();
         Fault::Trap(cut(&format!("{cause}{place}")))
     }
 }

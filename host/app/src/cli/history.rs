@@ -17,6 +17,23 @@ pub(crate) enum HistoryCommand {
         #[arg(long, default_value = "20", value_name = "CYCLES|TIME")]
         last: String,
     },
+    /// Step through recorded cycles one by one: what went in, the state, what came out.
+    Step {
+        /// The loop.
+        name: String,
+        /// How far back: a number of cycles, or a time such as 30s or 10m.
+        #[arg(long, default_value = "100", value_name = "CYCLES|TIME")]
+        last: String,
+        /// Begin at the cycle of this number.
+        #[arg(long, value_name = "CYCLE")]
+        from: Option<u64>,
+        /// Print so many cycles instead of showing one at a time; all of them where the output is no terminal.
+        #[arg(long, value_name = "N")]
+        count: Option<usize>,
+        /// Step each cycle again with what is built from this source, or with this component (.wasm), here and from the recorded state.
+        #[arg(long, value_name = "SOURCE")]
+        with: Option<PathBuf>,
+    },
     /// Make recorded steps again and compare them to the last bit.
     Replay {
         /// The loop.

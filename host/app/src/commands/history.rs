@@ -12,7 +12,7 @@ use bumpless_api::types::{
 };
 use indicatif::ProgressBar;
 
-use super::{curves, loops};
+use super::{curves, loops, step};
 use crate::{
     cli::HistoryCommand,
     client::{Answer, Client, encoded},
@@ -37,6 +37,23 @@ pub(crate) fn run(client: &Client, json: bool, what: HistoryCommand) -> Result<(
                 cycles(&answer.decode()?)
             }
         }
+        HistoryCommand::Step {
+            name,
+            last,
+            from,
+            count,
+            with,
+        } => step::run(
+            client,
+            json,
+            &step::Asked {
+                name,
+                last,
+                from,
+                count,
+                with,
+            },
+        ),
         HistoryCommand::Replay { name, last } => {
             let request = ReplayRequest {
                 last: Some(last),

@@ -72,7 +72,7 @@ pub(super) fn run(feed: &Feed, mut story: Story, json: bool, cycles: Option<u64>
 }
 
 /// One cycle as a line.
-fn row(record: &Record) -> String {
+pub(super) fn row(record: &Record) -> String {
     let output = record.outputs.values().next().copied().flatten();
     format!(
         "{:>10}  {:>4}  {:>8}  {:>8}  {:>8}  {:<8}  {:>7.1}  {:>8.1}",

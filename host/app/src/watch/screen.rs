@@ -3,7 +3,10 @@
 //! Draws at most ten times a second, whatever the loop's period. Never: leaves the terminal in disorder; it is restored on
 //! every way out, a panic included.
 
-use std::time::{Duration, Instant};
+use std::{
+    sync::mpsc::Receiver,
+    time::{Duration, Instant},
+};
 
 use ratatui::{
     Frame,
@@ -12,10 +15,11 @@ use ratatui::{
     style::{Color, Modifier, Style},
     symbols::Marker,
     text::{Line, Span},
-    widgets::{Axis, Block, Chart, Dataset, GraphType, Paragraph},
+    widgets::{Axis, Block, Chart, Dataset, GraphType, Paragraph, Wrap},
 };
 
 use super::{
+    dev::Said,
     feed::{Feed, News},
     story::Story,
 };
@@ -34,8 +38,13 @@ const COLORS: [Color; 6] = [
     Color::Red,
 ];
 
-/// Draws until `cycles` are seen or the reader quits.
-pub(super) fn run(feed: &Feed, mut story: Story, cycles: Option<u64>) -> Result<(), Error> {
+/// Draws until `cycles` are seen or the reader quits; or until builds end, where somebody builds.
+pub(super) fn run(
+    feed: &Feed,
+    mut story: Story,
+    cycles: Option<u64>,
+    builds: Option<&Receiver<Said>>,
+) -> Result<(), Error> {
     let failed = |source| Error::Terminal {
         action: "drawn on",
         source,
@@ -44,6 +53,9 @@ pub(super) fn run(feed: &Feed, mut story: Story, cycles: Option<u64>) -> Result<
     let end = (|| {
         loop {
             terminal.draw(|frame| draw(frame, &story)).map_err(failed)?;
+            if let Some(end) = builds.and_then(|builds| hear(&mut story, builds)) {
+                return end;
+            }
             let next = Instant::now() + FRAME;
             while let Some(left) = next.checked_duration_since(Instant::now()) {
                 match feed.next(left.min(Duration::from_millis(20))) {
@@ -60,6 +72,25 @@ pub(super) fn run(feed: &Feed, mut story: Story, cycles: Option<u64>) -> Result<
     })();
     ratatui::restore();
     end
+}
+
+/// Takes what became of builds; how they ended, where they did.
+fn hear(story: &mut Story, builds: &Receiver<Said>) -> Option<Result<(), Error>> {
+    while let Ok(said) = builds.try_recv() {
+        match said {
+            Said::Begun => story.build = Some(vec!["building …".to_owned()]),
+            Said::Done(text) => {
+                story.now(&text);
+                story.build = Some(vec![text]);
+            }
+            Said::Wrong(text) => {
+                story.now("the build is not in force");
+                story.build = Some(text.lines().map(str::to_owned).collect());
+            }
+            Said::Ended(end) => return Some(end),
+        }
+    }
+    None
 }
 
 fn take(story: &mut Story, news: News) {
@@ -92,11 +123,13 @@ fn keys(story: &mut Story) -> std::io::Result<bool> {
 
 /// The whole picture.
 fn draw(frame: &mut Frame<'_>, story: &Story) {
+    // Two lines of a frame, and the text; what a compiler says beyond that is in the text's first lines.
+    let middle = story.build.as_ref().map_or(4, |lines| lines.len().clamp(2, 12) + 2);
     let rows = Layout::vertical([
         Constraint::Length(3),
         Constraint::Fill(3),
         Constraint::Fill(1),
-        Constraint::Length(4),
+        Constraint::Length(u16::try_from(middle).unwrap_or(4)),
         Constraint::Length(8),
         Constraint::Length(1),
     ]);
@@ -104,7 +137,14 @@ fn draw(frame: &mut Frame<'_>, story: &Story) {
     frame.render_widget(Paragraph::new(heading(story)), head);
     draw_trend(frame, story, trend);
     draw_output(frame, story, output);
-    draw_steppers(frame, story, steppers);
+    match &story.build {
+        Some(lines) => {
+            let text: Vec<Line<'_>> = lines.iter().map(|line| Line::raw(line.as_str())).collect();
+            let block = Block::bordered().title(" build ");
+            frame.render_widget(Paragraph::new(text).wrap(Wrap { trim: false }).block(block), steppers);
+        }
+        None => draw_steppers(frame, story, steppers),
+    }
     let block = Block::bordered().title(" what happened ");
     let room = usize::from(block.inner(happenings).height);
     let skip = story.happenings.len().saturating_sub(room);
@@ -307,6 +347,35 @@ mod tests {
         ] {
             assert!(text.contains(part), "{part} is not in\n{text}");
         }
+    }
+
+    #[test]
+    fn what_becomes_of_a_build_is_shown() {
+        let mut story = story();
+        story.record(record(1, "a", &serde_json::json!([])));
+        let (sender, builds) = std::sync::mpsc::sync_channel(8);
+        let wrong = (0..40).map(|n| format!("law.st:{n}:6: there is no variable X{n}"));
+        for said in [
+            Said::Begun,
+            Said::Done("law@0.0.1 is in force 0.30 s after the save".to_owned()),
+            Said::Wrong(wrong.collect::<Vec<_>>().join("\n")),
+        ] {
+            sender.send(said).expect("room");
+        }
+        assert!(hear(&mut story, &builds).is_none());
+        let text = picture(&story, 120, 40);
+        for part in [
+            "law.st:0:6: there is no variable X0",
+            "X11",
+            "law@0.0.1 is in force",
+            "the build is not in force",
+            "build",
+        ] {
+            assert!(text.contains(part), "{part} is not in\n{text}");
+        }
+        sender.send(Said::Ended(Ok(()))).expect("room");
+        assert!(matches!(hear(&mut story, &builds), Some(Ok(()))));
+        picture(&story, 9, 4);
     }
 
     #[test]

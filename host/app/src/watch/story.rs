@@ -64,6 +64,8 @@ pub(super) struct Story {
     lost_now: u64,
     digest: String,
     start_us: Option<u64>,
+    /// What became of the last build, line by line, where somebody builds.
+    pub(super) build: Option<Vec<String>>,
 }
 
 impl Story {
@@ -95,6 +97,7 @@ impl Story {
             lost_now: 0,
             digest: found.digest.clone(),
             start_us: None,
+            build: None,
         }
     }
 
@@ -222,7 +225,8 @@ impl Story {
         }
     }
 
-    fn now(&mut self, text: &str) {
+    /// Something that a watcher is told beside the feed.
+    pub(super) fn now(&mut self, text: &str) {
         let t_s = self.samples.back().map_or(0.0, |s| s.t_s);
         self.happened(t_s, text);
     }
@@ -269,7 +273,7 @@ fn push<T>(queue: &mut VecDeque<T>, item: T, max: usize) {
 }
 
 /// An event for people; none for what happens all the time.
-fn in_words(event: &Event, record: &Record) -> Option<String> {
+pub(crate) fn in_words(event: &Event, record: &Record) -> Option<String> {
     Some(match event {
         Event::TookOver { from: Some(from) } => format!("{} took over from {from}, term {}", record.owner, record.term),
         Event::TookOver { from: None } => format!("{} began, term {}", record.owner, record.term),
