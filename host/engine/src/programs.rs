@@ -91,7 +91,7 @@ impl Code {
 impl Programs {
     pub(crate) fn new(config: &Config) -> Result<Self, Error> {
         let limits = config.limits.clone();
-        let engine = Profile::Program.runtime(0, &limits)?;
+        let engine = Profile::Program.runtime(0, &limits, false)?;
         let cache = config
             .cache_dir
             .as_ref()

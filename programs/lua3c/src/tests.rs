@@ -34,7 +34,7 @@ fn on_with(board: Board, plant: Option<Plant>, script: &[u8], saved: Option<Vec<
         Fault::BadParameter(text) | Fault::Failed(text) => text,
         other => panic!("{other:?}"),
     });
-    (ended, BOARD.with(|b| b.take()))
+    (ended, BOARD.with(std::cell::RefCell::take))
 }
 
 fn slot<'a>(board: &'a mut Board, name: &str) -> &'a mut f64 {

@@ -63,7 +63,7 @@ pub(crate) fn build(args: &BuildArgs) -> Result<(), Error> {
     ))
 }
 
-/// Tries a component in this process as an upload would, and keeps nothing of it. None where it is a plant, which says itself.
+/// Tries a component in this process as an upload would, and keeps nothing of it. None where it is a plant or a program, which is said.
 fn tried(bytes: &[u8], lines: bool) -> Result<Option<(Inspection, bumpless_core::Admission)>, Error> {
     let config = EngineConfig {
         instances_max: 8,
@@ -81,6 +81,14 @@ fn tried(bytes: &[u8], lines: bool) -> Result<Option<(Inspection, bumpless_core:
             let info = plant.info();
             show::line(&format!(
                 "{}@{} is a plant; it is tried at its upload",
+                info.name, info.version
+            ))?;
+            return Ok(None);
+        }
+        Either::Program(program, _) => {
+            let info = program.info();
+            show::line(&format!(
+                "{}@{} is a program; what it does shows once it runs",
                 info.name, info.version
             ))?;
             return Ok(None);
