@@ -405,7 +405,7 @@ mod tests {
 
     #[test]
     fn epochs_pass_while_something_runs_and_a_sleeping_ticker_is_woken() {
-        let engine = Profile::Program.runtime(0, &Limits::default()).unwrap();
+        let engine = Profile::Program.runtime(0, &Limits::default(), false).unwrap();
         let beats = Beats::default();
         let ticker = Ticker::start(engine, beats.clone()).unwrap();
         while !beats.0.asleep.load(Ordering::SeqCst) {
