@@ -7,9 +7,9 @@
 //! kills:   owner ─ kill -9 at a moment by the seed ─► another owner ─► restarted ─► joined ─► …    in which phase, is told
 //! probation: traps, spins, returns NaN, jumps, each after a few good cycles ─► rolled back in that same cycle
 //! ```
-//! What a loop of 1 kHz loses on a shared machine by itself is no matter of swaps. So nothing is changed at first, for half a
-//! minute, and above 200 Hz the cycles lost then are what the rest is held against: more than those, and than chance adds to such a
-//! number, are too many. Up to 200 Hz none may be lost.
+//! What a loop of 1 kHz loses on a shared machine by itself is no matter of swaps, and comes in bursts. So above 200 Hz turns of
+//! swaps and turns of the same length without any follow each other, and the differences of neighbours are judged: their mean may not
+//! be above zero by more than two of its standard errors. Up to 200 Hz no cycle may be lost.
 //! Up to 200 Hz the replicas share the steps. A faster loop is owned by the host that serves its points, as one would run it: on
 //! a machine where a message between two processes takes half a millisecond, no other host could answer within one.
 
@@ -54,8 +54,8 @@ const MISDEEDS: [(&str, &[(&str, f64)]); 4] = [
     ("returns-nan", &[]),
     ("jumps", &[("by", 50.0)]),
 ];
-/// How long nothing is changed at first, in s; a quick run takes a fifth of it.
-const UNDISTURBED_S: u64 = 30;
+/// Swaps of a turn.
+const TURN: u64 = 25;
 /// Longest wait for a swap that a kill hit.
 const SETTLE: Duration = Duration::from_secs(30);
 
@@ -167,17 +167,13 @@ pub(crate) fn run(options: Options, switching: Switching, report: &mut Report) -
     let wanted = |record: &Seen| record.seq > 100 && (switching.is_shared() || record.owner == "plant");
     history.wait("the first cycles", 0, wanted)?;
 
-    report.progress("nothing is changed at first");
-    let quiet_from_ns = clock.now_ns();
-    std::thread::sleep(Duration::from_secs(options.count(UNDISTURBED_S, UNDISTURBED_S / 5)));
-    let quiet = (quiet_from_ns, clock.now_ns());
-
     let before = Tally::ask(&api, LOOP)?;
     let from_ns = clock.now_ns();
     let seed = switching.kill.then_some(switching.seed);
     let killer = Killer::start(cell, seed, LOOP, Arc::clone(&history))?;
     let mut asked = Vec::new();
     let (mut refused, mut unchanged) = (0_u64, 0_u64);
+    let (mut turns, mut turn_from_ns): (Vec<Turn>, u64) = (Vec::new(), from_ns);
     let mut last_refusal = String::new();
     let plus = "pidplus";
     // The same law twice, then another law and back.
@@ -207,6 +203,16 @@ pub(crate) fn run(options: Options, switching: Switching, report: &mut Report) -
             }
         }
         switching.pause(begun);
+        if !switching.is_shared() && (number as u64 + 1).is_multiple_of(TURN) {
+            let turned_ns = clock.now_ns();
+            std::thread::sleep(Duration::from_nanos(turned_ns - turn_from_ns));
+            let turn = Turn {
+                swaps: (turn_from_ns, turned_ns),
+                none: (turned_ns, clock.now_ns()),
+            };
+            turn_from_ns = turn.none.1;
+            turns.push(turn);
+        }
     }
     let (cell, kills_ns) = killer.finish()?;
     let after = Tally::ask(&api, LOOP)?;
@@ -251,8 +257,6 @@ pub(crate) fn run(options: Options, switching: Switching, report: &mut Report) -
     if refused > 0 {
         report.progress(&format!("the last swap that was not taken: {last_refusal}"));
     }
-    let undisturbed = felt(&journal, POINT, switching.period_ns(), quiet, &stalls);
-    undisturbed.tell(report, "swap.undisturbed", Bound::None, Bound::None);
     let part = felt(&journal, POINT, switching.period_ns(), (from_ns, to_ns), &stalls);
     let taken_over = seen.iter().filter(|record| record.took_over).count();
     part.tell(report, "swap.swapping", Bound::None, Bound::None);
@@ -266,12 +270,10 @@ pub(crate) fn run(options: Options, switching: Switching, report: &mut Report) -
         Bound::None
     };
     report.figure("swap.swapping.cycles_lost_beyond", beyond as f64, "cycles", none);
-    report.figure(
-        "swap.swapping.cycles_lost_by_swaps",
-        excess((beyond, part.writes), &undisturbed),
-        "cycles",
-        Bound::AtMost(0.0),
-    );
+    if !switching.is_shared() {
+        let of = |span| felt(&journal, POINT, switching.period_ns(), span, &stalls);
+        tell_turns(report, turns.iter().map(|turn| (of(turn.swaps), of(turn.none))));
+    }
     report.told("swap.swapping.takeovers", taken_over as f64, "takeovers");
     after.tell_since(before, report, "swap.swapping");
     tell_misdeeds(report, &journal, &wrong);
@@ -283,30 +285,44 @@ pub(crate) fn run(options: Options, switching: Switching, report: &mut Report) -
         &stalls,
     );
     part.tell(report, "swap.probation", none, Bound::None);
-    report.figure(
-        "swap.probation.cycles_lost_by_misdeeds",
-        excess((part.lost, part.writes), &undisturbed),
-        "cycles",
-        Bound::AtMost(0.0),
-    );
     actuator::tell_writers(report, "swap", &journal);
     report.told("swap.feed_records_lost", history.lost() as f64, "records");
     stalls.tell(report, "swap");
     Ok(())
 }
 
-/// Cycles lost of so many written, beyond what as many undisturbed ones lose, and beyond two standard deviations of the
-/// difference of two such counts. Source: the variance of a Poisson count is its mean; that of the scaled one grows with the
-/// square of the scale.
-fn excess((lost, writes): (u64, u64), undisturbed: &Felt) -> f64 {
-    let scale = writes as f64 / undisturbed.writes.max(1) as f64;
-    let expected = undisturbed.lost as f64 * scale;
-    let deviation = (lost as f64 + expected * scale).sqrt();
-    if lost as f64 > expected + 2.0 * deviation {
-        lost as f64 - expected
-    } else {
-        0.0
+/// A turn of swaps and one without, in ns since 1970.
+#[derive(Debug, Clone, Copy)]
+struct Turn {
+    swaps: (u64, u64),
+    none: (u64, u64),
+}
+
+/// What turns with swaps lost more than their neighbours without.
+fn tell_turns(report: &mut Report, turns: impl Iterator<Item = (Felt, Felt)>) {
+    let (mut with, mut without, mut differences) = (Felt::default(), Felt::default(), Vec::new());
+    for (swaps, none) in turns {
+        differences.push(swaps.lost as f64 - none.lost as f64);
+        with.join(&swaps);
+        without.join(&none);
     }
+    with.tell(report, "swap.turns_with_swaps", Bound::None, Bound::None);
+    without.tell(report, "swap.turns_without", Bound::None, Bound::None);
+    report.figure(
+        "swap.cycles_lost_by_swaps",
+        excess(&differences),
+        "cycles",
+        Bound::AtMost(0.0),
+    );
+}
+
+/// The sum of the differences, where their mean is above zero by more than two of its standard errors; else nothing.
+fn excess(differences: &[f64]) -> f64 {
+    let n = differences.len() as f64;
+    let mean = differences.iter().sum::<f64>() / n.max(1.0);
+    let spread = differences.iter().map(|d| (d - mean).powi(2)).sum::<f64>();
+    let error = (spread / (n - 1.0).max(1.0) / n.max(1.0)).sqrt();
+    if mean > 2.0 * error { mean * n } else { 0.0 }
 }
 
 /// Brings the loop to a component, whatever a kill left behind.
@@ -415,4 +431,21 @@ fn tell_misdeeds(report: &mut Report, journal: &Journal, wrong: &[Wrong]) {
         "components",
         Bound::AtLeast(wrong.len() as f64),
     );
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_what_is_more_than_chance_counts() {
+        assert_eq!(excess(&[]), 0.0);
+        assert_eq!(excess(&[0.0; 20]), 0.0);
+        // One burst of the machine, in a turn with swaps.
+        let burst: Vec<f64> = (0..20).map(|n| if n == 7 { 22.0 } else { 0.0 }).collect();
+        assert_eq!(excess(&burst), 0.0);
+        // One or two cycles in every turn.
+        let steady: Vec<f64> = (0..20).map(|n| 1.0 + f64::from(n % 2)).collect();
+        assert_eq!(excess(&steady), 30.0);
+    }
 }

@@ -225,7 +225,8 @@ impl Room {
     }
 
     /// Before the first home opens: the newest records that other hosts have of our loops, for what our disk has may be a
-    /// second old. Bounded; a host that comes later is too late, and the terms that a restart skips keep its record out.
+    /// second old. Bounded; a host that comes later is too late, and the terms that a restart skips keep its record out. Who could
+    /// not be asked is asked again: just after a quick restart a member may still speak with the life before.
     pub(crate) async fn gather_records(self: &Arc<Self>) {
         let ours: Vec<LoopId> = self
             .book
@@ -246,20 +247,30 @@ impl Room {
                     let (room, ours) = (Arc::clone(self), Arc::clone(&ours));
                     asking.spawn(async move {
                         for some in ours.chunks(RECORDS_ASKED) {
-                            let Ok(Told::Records(records)) =
-                                room.ask(&host, Ask::Records(some.to_vec()), GATHER_WAIT).await
-                            else {
-                                return;
-                            };
-                            for record in records {
-                                room.feed.remember(&Arc::new(record));
+                            match room.ask(&host, Ask::Records(some.to_vec()), GATHER_WAIT).await {
+                                Ok(Told::Records(records)) => {
+                                    for record in records {
+                                        room.feed.remember(&Arc::new(record));
+                                    }
+                                }
+                                other => {
+                                    let why = other.err();
+                                    tracing::debug!(%host, ?why, "the records of a host could not be asked for; it is asked again");
+                                    return Some(host);
+                                }
                             }
                         }
+                        None
                     });
                 }
             }
             let pause = tokio::time::Instant::now() + LOOK_EVERY;
             tokio::time::sleep_until(pause.min(until)).await;
+            while let Some(answered) = asking.try_join_next() {
+                if let Ok(Some(host)) = answered {
+                    asked.remove(&host);
+                }
+            }
         }
     }
 

@@ -120,8 +120,8 @@ impl Profile {
             // Nothing is put off until it is first used: that would be in a cycle.
             .table_lazy_init(false)
             .memory_init_cow(false)
-            // The name of the first guest function is enough for a fault's text.
-            .wasm_backtrace_max_frames(NonZeroUsize::new(8))
+            // The name of the law's own function is enough for a fault's text; a panic puts a dozen of Rust's above it.
+            .wasm_backtrace_max_frames(NonZeroUsize::new(24))
             .generate_address_map(lines)
             // Said, because the default asks the environment.
             .wasm_backtrace_details(if lines {

@@ -4,7 +4,7 @@ import { mkdirSync, mkdtempSync, rmSync, writeFileSync } from "node:fs";
 import { tmpdir } from "node:os";
 import { join } from "node:path";
 import { expect, type Page, test } from "@playwright/test";
-import { ask, figure, loop, open, serious } from "./steps";
+import { ask, figure, loop, open, serious, undo } from "./steps";
 
 test.beforeEach(({ page }) => {
   page.on("pageerror", (error) => {
@@ -81,7 +81,7 @@ test("an alarm is defined, comes, is acknowledged, shelved, told again and goes"
   await page.getByRole("button", { name: "Unshelve tank-1 high" }).click();
   await expect.poll(async () => (await alarm("tank-1", "high"))?.quiet).toBe(false);
   // What is taken back can be taken back.
-  await page.getByRole("button", { name: "Undo" }).last().click();
+  await undo(page, "tank-1 high: told again");
   await expect.poll(async () => (await alarm("tank-1", "high"))?.shelf?.reason).toBe("the tank is being filled");
   await page.getByRole("button", { name: "Unshelve tank-1 high" }).click();
   await expect.poll(async () => (await alarm("tank-1", "high"))?.quiet).toBe(false);
@@ -203,7 +203,7 @@ test("a point that no loop writes is written, and taken back", async ({ page }) 
   await page.getByLabel("Value to write").fill(String(next));
   await page.getByRole("dialog").getByRole("button", { name: "Write", exact: true }).click();
   await expect.poll(async () => (await ask<{ value: number }>(`/v1/points/${name}`)).value).toBeCloseTo(next, 3);
-  await page.getByRole("button", { name: "Undo" }).last().click();
+  await undo(page, `${name}: `);
   await expect.poll(async () => (await ask<{ value: number }>(`/v1/points/${name}`)).value).toBeCloseTo(value, 3);
 });
 
@@ -255,7 +255,7 @@ test("preferred hosts, a fallback and votes are put in force as one revision, an
   expect(after.revision).toBe(before.revision + 1);
   expect(after.spec.policy.on_fewer).toBe("fault");
   expect(after.spec.fallback).toBeTruthy();
-  await page.getByRole("button", { name: "Undo" }).last().click();
+  await undo(page, `revision ${after.revision} is in force`);
   await expect.poll(async () => (await spec()).spec.prefer ?? []).toEqual([]);
   await page.getByLabel("Strategy").selectOption("round-robin");
   await expect.poll(async () => (await spec()).spec.strategy).toBe("round-robin");
@@ -300,7 +300,7 @@ test("what is changed stands in the audit trail, with before and after, and the 
   await page.getByLabel("New setpoint").fill("61.5");
   await page.getByRole("button", { name: "Set", exact: true }).click();
   await expect.poll(async () => (await loop("tank-3")).setpoint).toBe(61.5);
-  await page.getByRole("button", { name: "Undo" }).last().click();
+  await undo(page, "setpoint");
   await expect.poll(async () => (await loop("tank-3")).setpoint).toBe(before);
 
   await page.keyboard.press("9");

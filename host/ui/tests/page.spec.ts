@@ -202,6 +202,8 @@ test("everything can be done with the keyboard alone", async ({ page }) => {
   await page.keyboard.type(String(before - 2.5));
   await page.keyboard.press("Enter");
   await expect.poll(async () => (await loop("tank-3")).setpoint).toBe(before - 2.5);
+  // The cell may have it before the page offers to take it back.
+  await expect(page.locator(".message").filter({ hasText: "tank-3: setpoint" })).toBeVisible();
   // Within a field a letter is a letter.
   await page.keyboard.press("Shift+Tab");
   await page.keyboard.press("u");

@@ -38,6 +38,10 @@ export interface Loop {
 }
 export const loop = (name: string): Promise<Loop> => ask<Loop>(`/v1/loops/${name}`);
 
+/** Takes back what was said in these words: the cell may have it before the page has said it, and other words may still stand there. */
+export const undo = (page: Page, said: string | RegExp): Promise<void> =>
+  page.locator(".message").filter({ hasText: said }).last().getByRole("button", { name: "Undo" }).click();
+
 /** Nothing serious for those who use the page with other senses. */
 export async function serious(page: Page, what: string): Promise<string[]> {
   await page.evaluate(axe_source);

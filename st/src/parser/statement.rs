@@ -32,55 +32,37 @@ const ENDS: [&str; 17] = [
 impl Parser<'_> {
     /// Statements up to one of the words, or to a word that closes something outside.
     pub(super) fn statements(&mut self, ends: &[&str]) -> Vec<Stmt> {
-        let mut statements = Vec::new();
-        loop {
-            let closes = match self.kind() {
-                Kind::End => true,
-                Kind::Ident(word) => {
-                    ends.contains(&word.as_str())
-                        || word.starts_with("END_")
-                        || matches!(
-                            word.as_str(),
-                            "ELSIF" | "ELSE" | "UNTIL" | "PROGRAM" | "FUNCTION" | "FUNCTION_BLOCK" | "TYPE"
-                        )
-                }
-                _ => false,
-            };
-            if closes {
-                return statements;
+        self.statements_until(|parser| match parser.kind() {
+            Kind::End => true,
+            Kind::Ident(word) => {
+                ends.contains(&word.as_str())
+                    || word.starts_with("END_")
+                    || matches!(
+                        word.as_str(),
+                        "ELSIF" | "ELSE" | "UNTIL" | "PROGRAM" | "FUNCTION" | "FUNCTION_BLOCK" | "TYPE"
+                    )
             }
-            if self.take_symbol(";") || matches!(self.kind(), Kind::Pragma(_)) && !self.pragmas().is_empty() {
-                continue;
-            }
-            let before = self.at;
-            match self.deeper(Self::statement) {
-                Ok(statement) => statements.push(statement),
-                Err(Slip) => {
-                    if self.at == before {
-                        self.bump();
-                    }
-                    self.recover(&ENDS);
-                }
-            }
-        }
+            _ => false,
+        })
     }
 
     /// Case elements end where the next label begins.
     fn case_statements(&mut self) -> Vec<Stmt> {
-        let mut statements = Vec::new();
-        loop {
-            let closes = match self.kind() {
-                Kind::End | Kind::Int(_) | Kind::Prefix(_) | Kind::Symbol("-") => true,
-                Kind::Ident(word) => {
-                    word.starts_with("END_")
-                        || matches!(word.as_str(), "ELSE" | "ELSIF" | "UNTIL")
-                        || matches!(self.ahead(1), Kind::Symbol(":" | "," | ".."))
-                }
-                _ => false,
-            };
-            if closes {
-                return statements;
+        self.statements_until(|parser| match parser.kind() {
+            Kind::End | Kind::Int(_) | Kind::Prefix(_) | Kind::Symbol("-") => true,
+            Kind::Ident(word) => {
+                word.starts_with("END_")
+                    || matches!(word.as_str(), "ELSE" | "ELSIF" | "UNTIL")
+                    || matches!(parser.ahead(1), Kind::Symbol(":" | "," | ".."))
             }
+            _ => false,
+        })
+    }
+
+    /// Statements up to where a list of them closes; what is none is told, and passed over.
+    fn statements_until(&mut self, closes: impl Fn(&Self) -> bool) -> Vec<Stmt> {
+        let mut statements = Vec::new();
+        while !closes(self) {
             if self.take_symbol(";") || matches!(self.kind(), Kind::Pragma(_)) && !self.pragmas().is_empty() {
                 continue;
             }
@@ -95,6 +77,7 @@ impl Parser<'_> {
                 }
             }
         }
+        statements
     }
 
     fn statement(&mut self) -> Parsed<Stmt> {
