@@ -19,6 +19,7 @@ mod io;
 mod killer;
 mod kills;
 mod lab;
+mod languages;
 mod law;
 mod local;
 mod masters;
@@ -88,6 +89,8 @@ enum Bench {
     History,
     /// A step native and in the sandbox, and the cycle of a loop whose owner, replica and I/O are one process.
     Step,
+    /// The example law in every language: size, compile, instantiate, step, memory, and the ratio to native.
+    Languages,
     /// 1,000 points on ten Modbus devices at 10 Hz: requests, staleness, processor time; and one device that is slow.
     Io,
     /// The other process of `io`.
@@ -164,6 +167,7 @@ fn run(bench: &Bench, options: Options) -> Result<bool, Error> {
         Bench::History => "history",
         Bench::Lab => "lab",
         Bench::Step => "step",
+        Bench::Languages => "languages",
         Bench::Upload => "upload",
         Bench::Page(_) => "page",
         Bench::Io => "io",
@@ -185,6 +189,7 @@ fn run(bench: &Bench, options: Options) -> Result<bool, Error> {
         Bench::Swap(_) => swap::run(options, &mut report)?,
         Bench::History => archive::run(options, &mut report)?,
         Bench::Lab => lab::run(options, &mut report)?,
+        Bench::Languages => languages::run(options, &mut report)?,
         Bench::Step => step::run(options, &mut report)?,
         Bench::Upload => upload::run(options, &mut report)?,
         Bench::Page(watching) => page::run(options, *watching, &mut report)?,

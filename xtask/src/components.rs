@@ -1,10 +1,10 @@
-//! Builds every controller (`controllers/*`) and every test guest (`tests/guests/*`) into a component.
+//! Builds every controller (`controllers/*`), plant, example (`examples/*`) and test guest (`tests/guests/*`) into a component.
 //!
 //! ```text
 //!   cargo build --target wasm32-unknown-unknown ─► core module ─► wit-component ─► check of imports ─► target/components
 //! ```
 //! Owns the folder `target/components`: `<name>.wasm` for controllers, `guests/<name>.wasm` for guests; the name is the crate's
-//! folder. A crate takes part when it has a `cdylib` target. A component may import nothing but `bumpless:control@0.1.0`;
+//! folder; plants and examples have folders of their own like guests. A crate takes part when it has a `cdylib` target. A component may import nothing but `bumpless:control@0.1.0`;
 //! a guest whose misdeed is another import says so with `[package.metadata.component] imports = "any"`.
 //! Safe to run from several processes at once: one works, the others wait and find the work done.
 //! Never: downloads anything but, through rustup, the compiler's own target.
@@ -49,8 +49,13 @@ pub enum Error {
         output: String,
     },
     /// The target is missing, and rustup cannot add it.
-    #[error("the target {TARGET} is missing: `rustup target add {TARGET}` adds it")]
-    Target(#[source] Box<Error>),
+    #[error("the target {target} is missing: `rustup target add {target}` adds it")]
+    Target {
+        /// Which.
+        target: &'static str,
+        /// What rustup says.
+        source: Box<Error>,
+    },
     /// Cargo's messages are not what is expected.
     #[error("cargo wrote a message that cannot be read: use the Rust version of rust-toolchain or rust-version")]
     Message(#[source] serde_json::Error),
@@ -96,6 +101,8 @@ pub struct Built {
     pub guest: bool,
     /// Is it a simulated plant?
     pub plant: bool,
+    /// Is it an example of docs/, not a stock controller?
+    pub example: bool,
     /// Its size.
     pub bytes: u64,
     /// Its digest.
@@ -131,12 +138,19 @@ struct PackageMetadata {
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct ComponentMetadata {
+    #[serde(default)]
     imports: Imports,
+    /// Is it built by a script of its own (`languages`)?
+    #[serde(default)]
+    script: bool,
 }
 
-#[derive(Deserialize, Clone, Copy, PartialEq, Eq)]
+#[derive(Deserialize, Default, Clone, Copy, PartialEq, Eq)]
 #[serde(rename_all = "kebab-case")]
 enum Imports {
+    /// Only those of the interfaces.
+    #[default]
+    Ours,
     /// Imports are not checked.
     Any,
 }
@@ -159,6 +173,7 @@ struct Source {
     name: String,
     guest: bool,
     plant: bool,
+    example: bool,
     any_import: bool,
 }
 
@@ -184,6 +199,8 @@ pub fn run() -> Result<(), Error> {
             format!("guests/{}", c.name)
         } else if c.plant {
             format!("plants/{}", c.name)
+        } else if c.example {
+            format!("examples/{}", c.name)
         } else {
             c.name.clone()
         };
@@ -192,12 +209,13 @@ pub fn run() -> Result<(), Error> {
     Ok(())
 }
 
-/// Builds what is not built yet. Gives the folder and what is in it: controllers first, then guests, by name.
+/// Builds what is not built yet. Gives the folder and what is in it: controllers first, then examples, plants and guests, by
+/// name.
 pub fn build_all() -> Result<(PathBuf, Vec<Built>), Error> {
     let metadata = metadata()?;
     let sources = sources(&metadata);
     let folder = metadata.target_directory.join("components");
-    for inner in ["guests", "plants"].map(|name| folder.join(name)) {
+    for inner in ["guests", "plants", "examples"].map(|name| folder.join(name)) {
         fs::create_dir_all(&inner).map_err(|source| Error::File {
             path: inner.clone(),
             action: "written",
@@ -259,7 +277,7 @@ fn metadata() -> Result<Metadata, Error> {
     serde_json::from_slice(&text).map_err(Error::Message)
 }
 
-/// The crates with a `cdylib` under `controllers`, `plants` and `tests/guests`, in this order, by name.
+/// The crates with a `cdylib` under `controllers`, `examples`, `plants` and `tests/guests`, in this order, by name.
 fn sources(metadata: &Metadata) -> Vec<Source> {
     let mut sources: Vec<Source> = metadata
         .packages
@@ -272,34 +290,51 @@ fn sources(metadata: &Metadata) -> Vec<Source> {
             let name = folder.file_name()?.to_str()?.to_owned();
             let component = p.metadata.as_ref().and_then(|m| m.component.as_ref());
             let any_import = component.is_some_and(|c| c.imports == Imports::Any);
+            if component.is_some_and(|c| c.script) {
+                return None;
+            }
             let plant = place == Path::new("plants");
-            let ours = guest || plant || place == Path::new("controllers");
+            let example = place == Path::new("examples");
+            let ours = guest || plant || example || place == Path::new("controllers");
             ours.then(|| Source {
                 id: p.id.clone(),
                 package: p.name.clone(),
                 name,
                 guest,
                 plant,
+                example,
                 any_import,
             })
         })
         .collect();
-    sources.sort_by(|a, b| (a.guest, a.plant, &a.name).cmp(&(b.guest, b.plant, &b.name)));
+    sources.sort_by(|a, b| (a.guest, a.plant, a.example, &a.name).cmp(&(b.guest, b.plant, b.example, &b.name)));
     sources
 }
 
 /// Adds the wasm target through rustup where the compiler does not have it.
 pub(crate) fn ensure_target() -> Result<(), Error> {
+    ensure(TARGET)
+}
+
+/// The target whose standard library asks for an operating system.
+pub(crate) fn ensure_wasip2() -> Result<(), Error> {
+    ensure("wasm32-wasip2")
+}
+
+fn ensure(target: &'static str) -> Result<(), Error> {
     let text = output(
         "rustc",
-        command("rustc").args(["--print", "target-libdir", "--target", TARGET]),
+        command("rustc").args(["--print", "target-libdir", "--target", target]),
     )?;
     if Path::new(String::from_utf8_lossy(&text).trim()).is_dir() {
         return Ok(());
     }
-    output("rustup", command("rustup").args(["target", "add", TARGET]))
+    output("rustup", command("rustup").args(["target", "add", target]))
         .map(drop)
-        .map_err(|e| Error::Target(Box::new(e)))
+        .map_err(|e| Error::Target {
+            target,
+            source: Box::new(e),
+        })
 }
 
 /// Compiler flags, as a cargo setting that is joined with `.cargo/config.toml`: panic messages name files, and without these
@@ -360,11 +395,13 @@ fn componentize(source: &Source, modules: &[(String, PathBuf, bool)], folder: &P
         folder.join("guests").join(file)
     } else if source.plant {
         folder.join("plants").join(file)
+    } else if source.example {
+        folder.join("examples").join(file)
     } else {
         folder.join(file)
     };
     if !(*fresh && is_newer(&path, module)) {
-        let bytes = encode(source, &read(module)?)?;
+        let bytes = encode(&source.name, source.any_import, &read(module)?)?;
         write_whole(&path, &bytes)?;
     }
     let bytes = read(&path)?;
@@ -374,6 +411,7 @@ fn componentize(source: &Source, modules: &[(String, PathBuf, bool)], folder: &P
         path,
         guest: source.guest,
         plant: source.plant,
+        example: source.example,
         bytes: bytes.len() as u64,
         digest,
     })
@@ -385,7 +423,7 @@ fn is_newer(path: &Path, other: &Path) -> bool {
     matches!((time(path), time(other)), (Some(a), Some(b)) if a >= b)
 }
 
-fn read(path: &Path) -> Result<Vec<u8>, Error> {
+pub(crate) fn read(path: &Path) -> Result<Vec<u8>, Error> {
     fs::read(path).map_err(|source| Error::File {
         path: path.to_owned(),
         action: "read",
@@ -394,7 +432,7 @@ fn read(path: &Path) -> Result<Vec<u8>, Error> {
 }
 
 /// Writes beside the file, then renames: a reader sees the old or the new component, never a part of one.
-fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), Error> {
+pub(crate) fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), Error> {
     let beside = path.with_extension("wasm.new");
     fs::File::create(&beside)
         .and_then(|mut file| file.write_all(bytes))
@@ -406,9 +444,10 @@ fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), Error> {
         })
 }
 
-fn encode(source: &Source, module: &[u8]) -> Result<Vec<u8>, Error> {
+/// Makes a component of a core module.
+pub(crate) fn encode(name: &str, any_import: bool, module: &[u8]) -> Result<Vec<u8>, Error> {
     let refused = |reason: String| Error::Encode {
-        name: source.name.clone(),
+        name: name.to_owned(),
         reason,
     };
     let bytes = ComponentEncoder::default()
@@ -416,14 +455,14 @@ fn encode(source: &Source, module: &[u8]) -> Result<Vec<u8>, Error> {
         .map(|encoder| encoder.validate(true))
         .and_then(ComponentEncoder::encode)
         .map_err(|e| refused(format!("{e:#}")))?;
-    if !source.any_import {
-        check_imports(&source.name, &bytes)?;
+    if !any_import {
+        check_imports(name, &bytes)?;
     }
     Ok(bytes)
 }
 
 /// A component may import from [`PACKAGE`] alone.
-fn check_imports(name: &str, component: &[u8]) -> Result<(), Error> {
+pub(crate) fn check_imports(name: &str, component: &[u8]) -> Result<(), Error> {
     let imports = imports(component).map_err(|reason| Error::Encode {
         name: name.to_owned(),
         reason,
@@ -470,7 +509,7 @@ mod tests {
         let (folder, first) = build_all().expect("components build");
         let names: Vec<&str> = first
             .iter()
-            .filter(|c| !c.guest && !c.plant)
+            .filter(|c| !c.guest && !c.plant && !c.example)
             .map(|c| c.name.as_str())
             .collect();
         assert_eq!(
