@@ -100,11 +100,18 @@ impl Reencode for Stubs {
             .unwrap_or_else(|| func - imported + self.kept))
     }
 
-    fn parse_import(&mut self, imports: &mut ImportSection, import: wasmparser::Import<'_>) -> Done {
-        if matches!(import.ty, TypeRef::Func(_)) && is_of_a_system(import.module) {
-            return Ok(());
+    fn parse_import_section(
+        &mut self,
+        imports: &mut ImportSection,
+        section: wasmparser::ImportSectionReader<'_>,
+    ) -> Done {
+        for import in section.into_imports() {
+            let import = import?;
+            if !(matches!(import.ty, TypeRef::Func(_)) && is_of_a_system(import.module)) {
+                reencode::utils::parse_import(self, imports, import)?;
+            }
         }
-        reencode::utils::parse_import(self, imports, import)
+        Ok(())
     }
 
     fn parse_function_section(
