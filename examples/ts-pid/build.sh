@@ -1,6 +1,6 @@
 #!/bin/sh
 # Builds a component of law.ts: sh build.sh [OUT]. BUILD is where the JavaScript goes; TOOLS names the folder with tsc and
-# componentize-qjs where npm installed elsewhere.
+# componentize-qjs where npm installed elsewhere; WIT the folder with the interfaces, in a copy of this folder elsewhere.
 set -eu
 cd "$(dirname "$0")"
 PATH="${TOOLS:-$PWD/node_modules/.bin}:$PATH"
@@ -8,4 +8,4 @@ build="${BUILD:-build}"
 tsc --outDir "$build/js"
 # QuickJS with its libc asks for WASI, and a controller has no operating system: --stub-wasi puts traps in its place.
 # --sync: the host calls without the component model's async.
-componentize-qjs --wit ../../wit --world controller --sync --stub-wasi --js "$build/js/law.js" --output "${1:-ts-pid.wasm}"
+componentize-qjs --wit "${WIT:-../../wit}" --world controller --sync --stub-wasi --js "$build/js/law.js" --output "${1:-ts-pid.wasm}"

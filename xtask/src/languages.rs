@@ -23,6 +23,9 @@ use crate::{
 /// Characters of a failed command's words that are shown.
 const SAID_CHARS_MAX: usize = 4_000;
 
+/// Folders beside sources that are none: whoever builds an example by hand has them.
+pub(crate) const LEFT_BY_TOOLS: [&str; 5] = ["node_modules", "build", "venv", "__pycache__", "target"];
+
 /// The examples that are built here, by their folders in `examples/`.
 pub const EXAMPLES: [Example; 5] = [
     Example {
@@ -166,7 +169,8 @@ impl Example {
         script
             .arg("build.sh")
             .current_dir(self.folder())
-            .env("BUILD", &workshop);
+            .env("BUILD", &workshop)
+            .env_remove("WIT");
         self.ready(&mut script)?;
         // What this tool does for the script in a shell, it does itself here: it is the tool.
         script.env("XTASK", ":");
@@ -248,7 +252,7 @@ impl Example {
                 let path = entry.map_err(file_error(&folder))?.path();
                 let own = path
                     .file_name()
-                    .is_some_and(|name| name != "node_modules" && name != "build");
+                    .is_some_and(|name| LEFT_BY_TOOLS.iter().all(|left| name != *left));
                 if own && path.is_dir() {
                     folders.push(path);
                 } else if own && path.extension().is_none_or(|kind| kind != "wasm") {
@@ -287,5 +291,7 @@ fn clang() -> Result<(), Error> {
 }
 
 fn run_apt() -> Result<(), Error> {
+    // A fresh machine has no lists, and finds nothing then.
+    crate::run::run(program("apt-get").args(["update", "--quiet"]))?;
     crate::run::run(program("apt-get").args(["install", "--yes", "--no-install-recommends", "clang", "lld"]))
 }

@@ -3,6 +3,7 @@
 //! Never: a part of the product.
 
 pub mod bindings;
+pub mod book;
 pub mod check;
 pub mod components;
 pub mod languages;

@@ -3,7 +3,7 @@
 use std::{path::PathBuf, process::ExitCode};
 
 use clap::Parser;
-use xtask::{Error, bindings, check, components, languages, page, product, reference};
+use xtask::{Error, bindings, book, check, components, languages, page, product, reference};
 
 /// Sets up, builds and checks Bumpless.
 #[derive(Parser)]
@@ -98,7 +98,7 @@ fn main() -> ExitCode {
         Command::Page => page::build(),
         Command::Openapi => product::openapi(),
         Command::Wit => reference::write(),
-        Command::Book => product::book(),
+        Command::Book => book::build(),
     };
     match done {
         Ok(()) => ExitCode::SUCCESS,

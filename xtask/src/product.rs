@@ -1,4 +1,4 @@
-//! `cargo xtask demo`, `bench`, `model`, `simulate`, `openapi` and `book`: builds what is needed, then runs the product.
+//! `cargo xtask demo`, `bench`, `model`, `simulate` and `openapi`: builds what is needed, then runs the product.
 
 use std::process::Stdio;
 
@@ -46,17 +46,6 @@ pub fn bench(arguments: &[String]) -> Result<(), Error> {
 pub fn tool(name: &str, arguments: &[String]) -> Result<(), Error> {
     run(&mut cargo(&format!("build --release --package {name}")))?;
     run(program(target_folder().join("release").join(name)).args(arguments))
-}
-
-/// Builds the book into `target/book`.
-///
-/// # Errors
-/// There is no mdBook, or a chapter that it does not find.
-pub fn book() -> Result<(), Error> {
-    let folder = target_folder().join("book");
-    run(program("mdbook").args(["build", "docs", "--dest-dir"]).arg(&folder))?;
-    say(&format!("{}", folder.join("index.html").display()));
-    Ok(())
 }
 
 /// Writes `docs/openapi.json` from the code.

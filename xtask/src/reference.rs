@@ -40,7 +40,7 @@ pub fn text() -> Result<String, Error> {
     let package = resolve.packages.get(package).ok_or_else(|| refused(&"no package"))?;
     let mut out = format!("# The interfaces: `{}`\n\n", package.name);
     out.push_str(
-        "Written from [`wit/control.wit`](../../wit/control.wit) by `cargo xtask wit`; a test holds it to that.\n",
+        "Written from [`wit/`](../../wit) by `cargo xtask wit`; a test holds it to that.\n",
     );
     for (name, id) in &package.worlds {
         let Some(world) = resolve.worlds.get(*id) else { continue };
@@ -213,7 +213,7 @@ const fn primitive(ty: &Type) -> &'static str {
 
 #[cfg(test)]
 mod tests {
-    #![allow(clippy::expect_used, reason = "tests")]
+    #![allow(clippy::expect_used, clippy::indexing_slicing, reason = "tests")]
 
     use super::*;
 
@@ -224,6 +224,51 @@ mod tests {
             kept == text().expect("wit/ is read"),
             "docs/book/wit.md is old: run `cargo xtask wit`"
         );
+    }
+
+    /// `a-name` as JavaScript has it: `aName`.
+    fn camel(name: &str) -> String {
+        let mut parts = name.split('-');
+        let first = parts.next().unwrap_or_default().to_owned();
+        parts.fold(first, |mut whole, part| {
+            let mut letters = part.chars();
+            whole.extend(letters.next().map(|letter| letter.to_ascii_uppercase()));
+            whole.push_str(letters.as_str());
+            whole
+        })
+    }
+
+    #[test]
+    fn the_types_of_typescript_have_every_name_of_the_world() {
+        let root = components::workspace_root();
+        let mut resolve = Resolve::default();
+        let (package, _) = resolve.push_path(root.join("wit")).expect("wit/ is read");
+        let world = resolve.select_world(&[package], Some("controller")).expect("the world");
+        let types = fs::read_to_string(root.join("examples/ts-pid/bumpless.d.ts")).expect("it is checked in");
+        let mut wanted = Vec::new();
+        let items = &resolve.worlds[world];
+        for item in items.imports.values().chain(items.exports.values()) {
+            let WorldItem::Interface { id, .. } = item else { continue };
+            let interface = &resolve.interfaces[*id];
+            wanted.extend(interface.functions.keys().map(|name| format!("{}(", camel(name))));
+            for id in interface.types.values() {
+                match &resolve.types[*id].kind {
+                    TypeDefKind::Record(record) => {
+                        wanted.extend(record.fields.iter().map(|field| format!("{}: ", camel(&field.name))));
+                    }
+                    TypeDefKind::Enum(choice) => {
+                        wanted.extend(choice.cases.iter().map(|case| format!("\"{}\"", case.name)));
+                    }
+                    TypeDefKind::Variant(variant) => {
+                        wanted.extend(variant.cases.iter().map(|case| format!("\"{}\"", case.name)));
+                    }
+                    _ => {}
+                }
+            }
+        }
+        assert!(wanted.len() > 40, "{wanted:?}");
+        wanted.retain(|name| !types.contains(name.as_str()));
+        assert!(wanted.is_empty(), "examples/ts-pid/bumpless.d.ts lacks {wanted:?}");
     }
 
     #[test]
