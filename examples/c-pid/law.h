@@ -1,4 +1,4 @@
-/* The arithmetic of the example law, PI(D) with clamping. ../rust-pid/src/law.rs has the formulae and their sources.
+/* The arithmetic of the example law, PI(D) with clamping. examples/rust-pid/src/law.rs has the formulae and their sources.
  *
  * Only + - * / and comparisons are used, in the same order as in the other languages, so the numbers are the same to the last
  * bit: WebAssembly has no fused multiply-add that a compiler could put in their place. */

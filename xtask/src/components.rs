@@ -244,7 +244,7 @@ pub fn build_all() -> Result<(PathBuf, Vec<Built>), Error> {
 
 /// A command in the workspace's root, without what an outer `cargo` put into the environment: flags for the host would
 /// change the guests and make cargo build them anew.
-fn command(program: &str) -> Command {
+pub(crate) fn command(program: &str) -> Command {
     let mut command = Command::new(program);
     command.current_dir(workspace_root()).stdin(Stdio::null());
     for name in [

@@ -165,12 +165,11 @@ impl Example {
         if is_fresh && out.is_file() {
             return Ok(out);
         }
-        let mut script = Command::new("sh");
+        let mut script = components::command("sh");
         script
             .arg("build.sh")
             .current_dir(self.folder())
-            .env("BUILD", &workshop)
-            .env_remove("WIT");
+            .env("BUILD", &workshop);
         self.ready(&mut script)?;
         // What this tool does for the script in a shell, it does itself here: it is the tool.
         script.env("XTASK", ":");
