@@ -16,16 +16,23 @@ use crate::{
     Error, components,
     languages::LEFT_BY_TOOLS,
     run::{program, run, say, target_folder},
+    tool::Tool,
+};
+
+/// In the version that `docs/book.toml` is written for; without its web server, which takes minutes to build.
+const MDBOOK: Tool = Tool {
+    name: "mdbook",
+    version: "0.5.4",
+    arguments: "--no-default-features --features search",
 };
 
 /// Builds the book.
 ///
 /// # Errors
-/// There is no mdBook, a chapter that it does not find, or a file that cannot be copied.
+/// mdBook that cannot be built, a chapter that it does not find, or a file that cannot be copied.
 pub fn build() -> Result<(), Error> {
     let (root, out) = (components::workspace_root(), target_folder().join("book"));
-    let mut command = program("mdbook");
-    run(command
+    run(program(MDBOOK.path()?)
         .arg("build")
         .arg(root.join("docs"))
         .arg("--dest-dir")

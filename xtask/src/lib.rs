@@ -15,5 +15,6 @@ mod deny;
 mod error;
 mod run;
 mod stub;
+mod tool;
 
 pub use error::Error;

@@ -70,7 +70,7 @@ enum Command {
     Openapi,
     /// Writes docs/book/wit.md from the interfaces.
     Wit,
-    /// Builds the book of docs/ into target/book. Needs mdBook: `cargo install --locked mdbook`.
+    /// Builds the book of docs/ into target/book, with mdBook, which is built first where it is not installed.
     Book,
 }
 
