@@ -123,9 +123,9 @@ fn what_is_no_controller_is_refused_in_words() {
         ..Guest::good()
     }
     .build();
-    let precompiled = bumpless_engine::precompile(
+    let precompiled = precompile(
         &Guest::good().build(),
-        bumpless_engine::Profile::Pooled,
+        Profile::Pooled,
         &Limits::default(),
     )
     .unwrap();
@@ -284,12 +284,12 @@ fn a_component_of_several_with_memories_of_their_own_compiles() {
                  (func (export "realloc") (param i32 i32 i32 i32) (result i32) i32.const 0))
                (core instance $i (instantiate $m))
                (func (export "length") (param "text" string) (result u32)
-                 (canon lift (core func $i "length") (memory $i "memory") (realloc (func $i "realloc")))))
+                 (canon lift (core func $i "length") (memory (core memory $i "memory")) (realloc (core func $i "realloc")))))
              (component $outer
                (import "length" (func $length (param "text" string) (result u32)))
                (core module $memory (memory (export "memory") 1))
                (core instance $own (instantiate $memory))
-               (core func $lowered (canon lower (func $length) (memory $own "memory")))
+               (core func $lowered (canon lower (func $length) (memory (core memory $own "memory"))))
                (core module $m
                  (import "inner" "length" (func $length (param i32 i32) (result i32)))
                  (func (export "run") (result i32) (call $length (i32.const 0) (i32.const 3))))
@@ -301,6 +301,7 @@ fn a_component_of_several_with_memories_of_their_own_compiles() {
     )
     .unwrap();
     for profile in [Profile::Pooled, Profile::OnDemand] {
-        assert!(precompile(&joined, profile, &Limits::default()).is_ok(), "{profile:?}");
+        let compiled = precompile(&joined, profile, &Limits::default());
+        assert!(compiled.is_ok(), "{profile:?}: {:?}", compiled.err());
     }
 }
