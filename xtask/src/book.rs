@@ -63,7 +63,10 @@ fn pointed_to(root: &Path) -> io::Result<BTreeSet<PathBuf>> {
             }
             let text = fs::read_to_string(&path)?;
             let from = folder.strip_prefix(root).unwrap_or(&folder);
-            let links = text.split("](").skip(1).filter_map(|rest| rest.split([')', '#']).next());
+            let links = text
+                .split("](")
+                .skip(1)
+                .filter_map(|rest| rest.split([')', '#']).next());
             let outside = links
                 .filter_map(|link| from_root(from, link))
                 .filter(|link| !link.starts_with("docs"));
@@ -91,7 +94,10 @@ fn from_root(folder: &Path, link: &str) -> Option<PathBuf> {
 }
 
 fn copy(from: &Path, to: &Path) -> io::Result<()> {
-    if from.file_name().is_some_and(|name| LEFT_BY_TOOLS.iter().any(|left| name == *left)) {
+    if from
+        .file_name()
+        .is_some_and(|name| LEFT_BY_TOOLS.iter().any(|left| name == *left))
+    {
         return Ok(());
     }
     if from.is_dir() {

@@ -39,9 +39,7 @@ pub fn text() -> Result<String, Error> {
         .map_err(|error| refused(&error))?;
     let package = resolve.packages.get(package).ok_or_else(|| refused(&"no package"))?;
     let mut out = format!("# The interfaces: `{}`\n\n", package.name);
-    out.push_str(
-        "Written from [`wit/`](../../wit) by `cargo xtask wit`; a test holds it to that.\n",
-    );
+    out.push_str("Written from [`wit/`](../../wit) by `cargo xtask wit`; a test holds it to that.\n");
     for (name, id) in &package.worlds {
         let Some(world) = resolve.worlds.get(*id) else { continue };
         line(&mut out, &format!("\n## World `{name}`\n"));
@@ -248,7 +246,9 @@ mod tests {
         let mut wanted = Vec::new();
         let items = &resolve.worlds[world];
         for item in items.imports.values().chain(items.exports.values()) {
-            let WorldItem::Interface { id, .. } = item else { continue };
+            let WorldItem::Interface { id, .. } = item else {
+                continue;
+            };
             let interface = &resolve.interfaces[*id];
             wanted.extend(interface.functions.keys().map(|name| format!("{}(", camel(name))));
             for id in interface.types.values() {

@@ -69,7 +69,11 @@ impl Stubs {
                 Payload::Version {
                     encoding: Encoding::Component,
                     ..
-                } => return Err("it is a component already; what is wanted is the core module that it was made of".to_owned()),
+                } => {
+                    return Err(
+                        "it is a component already; what is wanted is the core module that it was made of".to_owned(),
+                    );
+                }
                 Payload::ImportSection(section) => {
                     for import in section.into_imports() {
                         let import = import.map_err(|error| error.to_string())?;
@@ -216,16 +220,23 @@ mod tests {
                                 shape.referred.extend(functions.into_iter().map(Result::unwrap));
                             }
                             wasmparser::ElementItems::Expressions(_, all) => {
-                                all.into_iter().for_each(|e| shape.referred.extend(referred(&e.unwrap())));
+                                all.into_iter()
+                                    .for_each(|e| shape.referred.extend(referred(&e.unwrap())));
                             }
                         }
                     }
                 }
                 Payload::CodeSectionEntry(body) => {
-                    let operators: Vec<Operator<'_>> =
-                        body.get_operators_reader().unwrap().into_iter().map(Result::unwrap).collect();
+                    let operators: Vec<Operator<'_>> = body
+                        .get_operators_reader()
+                        .unwrap()
+                        .into_iter()
+                        .map(Result::unwrap)
+                        .collect();
                     let numbers = operators.iter().filter_map(|operator| match operator {
-                        Operator::Call { function_index } | Operator::RefFunc { function_index } => Some(*function_index),
+                        Operator::Call { function_index } | Operator::RefFunc { function_index } => {
+                            Some(*function_index)
+                        }
                         _ => None,
                     });
                     let traps = matches!(operators[..], [Operator::Unreachable, Operator::End]);

@@ -123,12 +123,7 @@ fn what_is_no_controller_is_refused_in_words() {
         ..Guest::good()
     }
     .build();
-    let precompiled = precompile(
-        &Guest::good().build(),
-        Profile::Pooled,
-        &Limits::default(),
-    )
-    .unwrap();
+    let precompiled = precompile(&Guest::good().build(), Profile::Pooled, &Limits::default()).unwrap();
 
     let cases: [(&str, &[u8], &str); 19] = [
         ("garbage", b"MZ\x90", "no WebAssembly component but something else"),
