@@ -198,9 +198,15 @@ fn a_project_in_c_is_built_by_its_script_and_passes_its_trial() {
     let tried = bumpless(&folder.path().join("level"), &["lab", "run", "experiment.toml"]);
     assert!(tried.status.success(), "{}", said(&tried));
     let law = folder.path().join("level/law.c");
-    let wrong = fs::read_to_string(&law).unwrap().replace("setpoint - pv;", "setpoint - pw;");
+    let wrong = fs::read_to_string(&law)
+        .unwrap()
+        .replace("setpoint - pv;", "setpoint - pw;");
     fs::write(&law, wrong).unwrap();
     let refused = bumpless(folder.path(), &["build", "level"]);
     assert_eq!(refused.status.code(), Some(1));
-    assert!(said(&refused).contains("law.c:") && said(&refused).contains("'pw'"), "{}", said(&refused));
+    assert!(
+        said(&refused).contains("law.c:") && said(&refused).contains("'pw'"),
+        "{}",
+        said(&refused)
+    );
 }

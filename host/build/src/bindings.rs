@@ -15,7 +15,9 @@ const WORLD: &str = "controller";
 pub(crate) fn c() -> Result<Vec<(String, Vec<u8>)>, Error> {
     let refused = |error: &dyn std::fmt::Display| Error::Encode(format!("{error:#}"));
     let mut resolve = Resolve::default();
-    let package = resolve.push_str("control.wit", CONTROL).map_err(|error| refused(&error))?;
+    let package = resolve
+        .push_str("control.wit", CONTROL)
+        .map_err(|error| refused(&error))?;
     let world = resolve
         .select_world(&[package], Some(WORLD))
         .map_err(|error| refused(&error))?;

@@ -169,7 +169,12 @@ mod tests {
             assert!(text(".gitignore").ends_with("__pycache__\n"));
             assert!(matches!(source(&project).unwrap(), Source::Script(_)));
         }
-        assert!(folder.path().join("my-c/bindings/controller_component_type.o").is_file());
+        assert!(
+            folder
+                .path()
+                .join("my-c/bindings/controller_component_type.o")
+                .is_file()
+        );
     }
 
     #[test]

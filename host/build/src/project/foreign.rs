@@ -27,8 +27,14 @@ const C: Foreign = Foreign {
         ("law.h", include_str!("../../../../examples/c-pid/law.h")),
         ("component.c", include_str!("../../../../examples/c-pid/component.c")),
         ("libc/libc.c", include_str!("../../../../examples/c-pid/libc/libc.c")),
-        ("libc/stdlib.h", include_str!("../../../../examples/c-pid/libc/stdlib.h")),
-        ("libc/string.h", include_str!("../../../../examples/c-pid/libc/string.h")),
+        (
+            "libc/stdlib.h",
+            include_str!("../../../../examples/c-pid/libc/stdlib.h"),
+        ),
+        (
+            "libc/string.h",
+            include_str!("../../../../examples/c-pid/libc/string.h"),
+        ),
         ("build.sh", include_str!("../templates/c.sh")),
     ],
     has_bindings: true,
@@ -54,8 +60,14 @@ const TS: Foreign = Foreign {
     law: "`law.ts` has ports, parameters, the law and the form of its state; `bumpless.d.ts` the types of `wit/`.",
     files: &[
         ("law.ts", include_str!("../../../../examples/ts-pid/law.ts")),
-        ("bumpless.d.ts", include_str!("../../../../examples/ts-pid/bumpless.d.ts")),
-        ("tsconfig.json", include_str!("../../../../examples/ts-pid/tsconfig.json")),
+        (
+            "bumpless.d.ts",
+            include_str!("../../../../examples/ts-pid/bumpless.d.ts"),
+        ),
+        (
+            "tsconfig.json",
+            include_str!("../../../../examples/ts-pid/tsconfig.json"),
+        ),
         ("package.json", include_str!("../../../../examples/ts-pid/package.json")),
         ("build.sh", include_str!("../templates/ts.sh")),
     ],
@@ -69,7 +81,10 @@ const PYTHON: Foreign = Foreign {
     law: "`law.py` has ports, parameters, the law and the form of its state.",
     files: &[
         ("law.py", include_str!("../../../../examples/python-pid/law.py")),
-        ("requirements.txt", include_str!("../../../../examples/python-pid/requirements.txt")),
+        (
+            "requirements.txt",
+            include_str!("../../../../examples/python-pid/requirements.txt"),
+        ),
         ("build.sh", include_str!("../templates/python.sh")),
     ],
     has_bindings: false,
@@ -122,7 +137,11 @@ impl Foreign {
         all.push(("wit/control.wit".to_owned(), bindings::CONTROL.into()));
         if self.has_bindings {
             let bindings = bindings::c()?;
-            all.extend(bindings.into_iter().map(|(file, bytes)| (format!("bindings/{file}"), bytes)));
+            all.extend(
+                bindings
+                    .into_iter()
+                    .map(|(file, bytes)| (format!("bindings/{file}"), bytes)),
+            );
         }
         Ok(all)
     }
