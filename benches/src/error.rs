@@ -17,6 +17,9 @@ pub(crate) enum Error {
     /// The components could not be built.
     #[error("the components could not be built")]
     Components(#[source] xtask::components::Error),
+    /// The example of another language could not be built.
+    #[error("an example could not be built")]
+    Example(#[source] xtask::Error),
     /// The sandbox refused something.
     #[error("the sandbox refused {what}")]
     Engine {

@@ -19,6 +19,7 @@ mod io;
 mod killer;
 mod kills;
 mod lab;
+mod languages;
 mod law;
 mod local;
 mod masters;
@@ -98,6 +99,8 @@ enum Bench {
     },
     /// A step native and in the sandbox, and the cycle of a loop whose owner, replica and I/O are one process.
     Step,
+    /// The example law in every language: size, compile, instantiate, step, memory, and the ratio to native.
+    Languages,
     /// 1,000 points on ten Modbus devices at 10 Hz: requests, staleness, processor time; and one device that is slow.
     Io,
     /// The other process of `io`.
@@ -176,6 +179,7 @@ fn run(bench: &Bench, options: Options) -> Result<bool, Error> {
         Bench::Programs => "programs",
         Bench::Scripts { .. } => "scripts",
         Bench::Step => "step",
+        Bench::Languages => "languages",
         Bench::Upload => "upload",
         Bench::Page(_) => "page",
         Bench::Io => "io",
@@ -199,6 +203,7 @@ fn run(bench: &Bench, options: Options) -> Result<bool, Error> {
         Bench::Lab => lab::run(options, &mut report)?,
         Bench::Programs => programs::run(options, &mut report)?,
         Bench::Scripts { folder } => scripts::run(folder, &mut report)?,
+        Bench::Languages => languages::run(options, &mut report)?,
         Bench::Step => step::run(options, &mut report)?,
         Bench::Upload => upload::run(options, &mut report)?,
         Bench::Page(watching) => page::run(options, *watching, &mut report)?,

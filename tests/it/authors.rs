@@ -180,3 +180,33 @@ fn a_project_is_checked_without_a_cell_and_told_where_it_is_wrong() {
     assert!(said(&refused).contains("level.st:"), "{}", said(&refused));
     assert!(said(&refused).contains("there is no variable PW"), "{}", said(&refused));
 }
+
+/// clang is there: the example in C is built before the tests are.
+#[test]
+fn a_project_in_c_is_built_by_its_script_and_passes_its_trial() {
+    xtask::languages::named("c-pid").unwrap().build().unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let made = bumpless(folder.path(), &["new", "c", "level"]);
+    assert!(made.status.success(), "{}", said(&made));
+    let checked = bumpless(folder.path(), &["check", "level"]);
+    assert!(checked.status.success(), "{}", said(&checked));
+    for part in ["level@0.1.0", "trial     passed", "state is taken over"] {
+        assert!(said(&checked).contains(part), "{part}: {}", said(&checked));
+    }
+    let built = bumpless(folder.path(), &["build", "level"]);
+    assert!(built.status.success(), "{}", said(&built));
+    let tried = bumpless(&folder.path().join("level"), &["lab", "run", "experiment.toml"]);
+    assert!(tried.status.success(), "{}", said(&tried));
+    let law = folder.path().join("level/law.c");
+    let wrong = fs::read_to_string(&law)
+        .unwrap()
+        .replace("setpoint - pv;", "setpoint - pw;");
+    fs::write(&law, wrong).unwrap();
+    let refused = bumpless(folder.path(), &["build", "level"]);
+    assert_eq!(refused.status.code(), Some(1));
+    assert!(
+        said(&refused).contains("law.c:") && said(&refused).contains("'pw'"),
+        "{}",
+        said(&refused)
+    );
+}

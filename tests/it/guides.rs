@@ -1,7 +1,8 @@
 //! The commands in the documentation do what they say: blocks of ```sh marked `<!-- run -->` are run.
 //!
 //! The blocks of one file run in their order in one shell and an empty folder, with `bumpless` on the path and
-//! `$COMPONENTS` naming the folder with the components. Whatever they leave behind is ended.
+//! `$COMPONENTS` naming the folder with the components. Whatever they leave behind is ended. In the book's own chapters
+//! (`docs/book`) every block is run, or is a file of the repository that is built by another test, or says why it is not.
 
 use std::{
     fmt::Write as _,
@@ -58,6 +59,7 @@ fn run(name: &str, blocks: &[Block]) -> Result<(), String> {
     let folder = tempfile::tempdir().map_err(|error| error.to_string())?;
     let binary = Binary::find().map_err(|error| error.to_string())?;
     let components = components().map_err(|error| error.to_string())?;
+    build_examples(blocks)?;
     let mut script = String::from("set -euo pipefail\n");
     for block in blocks {
         let _infallible = write!(script, "echo '--- {name}, line {}'\n{}\n", block.line, block.text);
@@ -93,32 +95,124 @@ fn run(name: &str, blocks: &[Block]) -> Result<(), String> {
     }
 }
 
-/// README.md and docs/*.md.
-fn documents() -> Vec<PathBuf> {
-    let root = repository();
-    let mut files: Vec<PathBuf> = fs::read_dir(root.join("docs"))
+/// The documents of a folder.
+fn documents_of(folder: &str) -> Vec<PathBuf> {
+    let mut files: Vec<PathBuf> = fs::read_dir(repository().join(folder))
         .unwrap()
         .map(|entry| entry.unwrap().path())
         .filter(|path| path.extension().is_some_and(|e| e == "md"))
         .collect();
-    files.push(root.join("README.md"));
     files.sort();
     files
 }
 
+/// README.md, docs/*.md and docs/book/*.md.
+fn documents() -> Vec<PathBuf> {
+    let mut files = vec![repository().join("README.md")];
+    files.extend(documents_of("docs"));
+    files.extend(documents_of("docs/book"));
+    files
+}
+
 /// The guides that are run, and the fewest blocks of each: a mark that is lost is a guide that nobody tries any more.
-const MARKED: [(&str, usize); 10] = [
+const MARKED: [(&str, usize); 15] = [
     ("api.md", 8),
     ("change-safely.md", 10),
     ("commissioning.md", 5),
+    ("deploying.md", 1),
     ("first-loop.md", 8),
+    ("grants.md", 2),
     ("lab.md", 3),
+    ("languages.md", 4),
     ("modbus.md", 6),
     ("programs.md", 6),
     ("redundancy.md", 3),
+    ("state.md", 3),
     ("structured-text.md", 7),
+    ("testing.md", 3),
     ("write-a-law.md", 3),
 ];
+
+/// Examples of other languages that blocks upload from `$COMPONENTS/examples`.
+const EXAMPLES: [&str; 3] = ["c-pid", "js-pid", "ts-pid"];
+
+/// Builds the examples that the blocks name.
+fn build_examples(blocks: &[Block]) -> Result<(), String> {
+    for name in EXAMPLES {
+        if blocks.iter().any(|block| block.text.contains(name)) {
+            let example = xtask::languages::named(name).ok_or("no such example")?;
+            example.build().map_err(|error| error.to_string())?;
+        }
+    }
+    Ok(())
+}
+
+/// Why a block of the book's own chapters is neither run nor a file; none where it may stand as it is.
+fn untried(folder: &Path, before: &str, kind: &str, body: &[&str]) -> Option<String> {
+    if before == "<!-- run -->" || before.starts_with("<!-- not run: ") {
+        return None;
+    }
+    let included = |line: &str| {
+        let file = line.strip_prefix("{{#include ")?.strip_suffix("}}")?;
+        folder.join(file).is_file().then_some(())
+    };
+    match (kind, body) {
+        ("text" | "wit", _) => None,
+        ("toml", _) => toml::from_str::<toml::Table>(&body.join("\n"))
+            .err()
+            .map(|error| error.to_string()),
+        (_, [line]) if included(line).is_some() => None,
+        _ => Some("it is neither run nor a file of the repository, and does not say why".to_owned()),
+    }
+}
+
+#[test]
+fn every_block_of_the_book_is_run_or_built() {
+    let mut found = Vec::new();
+    let mut count = 0;
+    for path in documents_of("docs/book") {
+        let text = fs::read_to_string(&path).unwrap();
+        let mut lines = text.lines().enumerate();
+        let mut before = "";
+        while let Some((n, line)) = lines.next() {
+            if let Some(kind) = line.strip_prefix("```") {
+                let body: Vec<&str> = lines
+                    .by_ref()
+                    .map(|(_, line)| line)
+                    .take_while(|line| *line != "```")
+                    .collect();
+                count += 1;
+                let why = untried(path.parent().unwrap(), before, kind, &body);
+                found.extend(why.map(|why| format!("{}, line {}: {why}", path.display(), n + 1)));
+            }
+            before = line;
+        }
+    }
+    assert!(found.is_empty(), "{}", found.join("\n"));
+    assert!(count > 20, "{count} blocks");
+    let here = Path::new(".");
+    assert!(untried(here, "", "sh", &["false"]).is_some());
+    assert!(untried(here, "", "sh", &["{{#include nowhere.sh}}"]).is_some());
+    assert!(untried(here, "", "toml", &["a = "]).is_some());
+}
+
+#[test]
+fn every_document_is_a_chapter_of_the_book() {
+    let summary = fs::read_to_string(repository().join("docs/SUMMARY.md")).unwrap();
+    let docs = repository().join("docs");
+    let missing: Vec<PathBuf> = ["docs", "docs/book", "docs/lab"]
+        .into_iter()
+        .flat_map(documents_of)
+        .filter(|path| path.file_name().is_some_and(|name| name != "SUMMARY.md"))
+        .filter(|path| {
+            summary
+                .matches(&format!("]({})", path.strip_prefix(&docs).unwrap().display()))
+                .count()
+                != 1
+        })
+        .collect();
+    assert!(missing.is_empty(), "docs/SUMMARY.md names each once: {missing:?}");
+}
 
 #[test]
 fn the_commands_in_the_guides_run() {

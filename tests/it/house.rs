@@ -86,6 +86,8 @@ const ROOMS: [(&str, &[&str]); 40] = [
     ("plant-cstr", &["bumpless-sdk"]),
     ("bumpless-model", &["bumpless-core"]),
     ("bumpless-simulation", &["bumpless-core"]),
+    ("rust-pid", &["bumpless-sdk"]),
+    ("rust-wasip2-pid", &["bumpless-sdk"]),
     ("xtask", &["bumpless-core"]),
 ];
 

@@ -31,6 +31,7 @@
 //! | library | trials, labels, bundles, bombs and crowds of components |
 //! | stock | every stock law passes its trial |
 //! | authors | a law in Structured Text from its project to a running loop, and back to `pid` |
+//! | languages | the example law in every language: the same numbers, swaps without a bump |
 //! | lab | virtual time against a live cell, and the ways between the two; plants as components |
 //! | guides | the commands in the documentation |
 //! | house | the rules of the source itself |
@@ -57,6 +58,7 @@ mod guides;
 mod history;
 mod house;
 mod lab;
+mod languages;
 mod library;
 mod masters;
 mod members;

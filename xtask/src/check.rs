@@ -1,7 +1,7 @@
 //! `cargo xtask test`: everything that has to hold, in the order in which a fault shows soonest.
 //!
 //! ```text
-//!   tools ─► format ─► dependencies ─► components ─► page ─► clippy ─► build ─► tests ─► page in a browser ─► documentation
+//!   tools ─► format ─► dependencies ─► components ─► languages ─► page ─► clippy ─► build ─► tests ─► page in a browser ─► documentation
 //! ```
 //! Owns the list of steps and what each needs set up. One step after the other: they share one target folder and two
 //! cores. The first that fails ends the run. Never: changes a source file.
@@ -9,18 +9,20 @@
 use std::time::{Duration, Instant};
 
 use crate::{
-    Error, components, deny, page,
+    Error, components, deny, languages, page,
     run::{cargo, output, program, run, say, target_folder},
 };
 
 /// A step: name, whether the quick run has it, and what it does.
 type Step = (&'static str, bool, fn(fast: bool) -> Result<(), Error>);
 
-const STEPS: [Step; 10] = [
+const STEPS: [Step; 11] = [
     ("tools", true, |_| tools()),
     ("format", true, |_| run(&mut cargo("fmt --all --check"))),
     ("dependencies", false, |_| deny::check()),
     ("components", true, |_| components::run().map_err(Error::from)),
+    // Their tools are fetched here, so that no test waits for a download.
+    ("languages", false, |_| languages::run(&[])),
     ("page", true, |_| page::build()),
     ("clippy", true, |_| {
         run(&mut cargo(

@@ -1,11 +1,12 @@
-//! Builds every controller (`controllers/*`), plant, program (`programs/*`) and test guest (`tests/guests/*`) into a component.
+//! Builds every controller (`controllers/*`), plant, program (`programs/*`), example (`examples/*`) and test guest
+//! (`tests/guests/*`) into a component.
 //!
 //! ```text
 //!   cargo build --target wasm32-unknown-unknown ─► core module ─► wit-component ─► check of imports ─► target/components
 //! ```
-//! Owns the folder `target/components`: `<name>.wasm` for controllers, `guests/<name>.wasm` for guests; the name is the crate's
-//! folder. A crate takes part when it has a `cdylib` target. A component may import nothing but `bumpless:control@0.1.0`;
-//! a guest whose misdeed is another import says so with `[package.metadata.component] imports = "any"`.
+//! Owns the folder `target/components`: `<name>.wasm` for controllers, and a folder for each other kind, as `guests/<name>.wasm`;
+//! the name is the crate's folder. A crate takes part when it has a `cdylib` target. A component may import nothing but
+//! `bumpless:control@0.1.0`; a guest whose misdeed is another import says so with `[package.metadata.component] imports = "any"`.
 //! Safe to run from several processes at once: one works, the others wait and find the work done.
 //! Never: downloads anything but, through rustup, the compiler's own target.
 
@@ -49,8 +50,13 @@ pub enum Error {
         output: String,
     },
     /// The target is missing, and rustup cannot add it.
-    #[error("the target {TARGET} is missing: `rustup target add {TARGET}` adds it")]
-    Target(#[source] Box<Error>),
+    #[error("the target {target} is missing: `rustup target add {target}` adds it")]
+    Target {
+        /// Which.
+        target: &'static str,
+        /// What rustup says.
+        source: Box<Error>,
+    },
     /// Cargo's messages are not what is expected.
     #[error("cargo wrote a message that cannot be read: use the Rust version of rust-toolchain or rust-version")]
     Message(#[source] serde_json::Error),
@@ -85,6 +91,47 @@ pub enum Error {
     NoModule(String),
 }
 
+/// What a component is for. In the order of the table.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Kind {
+    /// A stock controller.
+    Controller,
+    /// An example of the documents.
+    Example,
+    /// A stock program: it runs freely.
+    Program,
+    /// A simulated plant.
+    Plant,
+    /// A guest for tests.
+    Guest,
+}
+
+impl Kind {
+    const ALL: [Self; 5] = [Self::Controller, Self::Example, Self::Program, Self::Plant, Self::Guest];
+
+    /// The folder of its crates in the workspace.
+    const fn place(self) -> &'static str {
+        match self {
+            Self::Controller => "controllers",
+            Self::Example => "examples",
+            Self::Program => "programs",
+            Self::Plant => "plants",
+            Self::Guest => "tests/guests",
+        }
+    }
+
+    /// The folder of its components in the one of all; controllers lie in that one itself.
+    const fn folder(self) -> &'static str {
+        match self {
+            Self::Controller => "",
+            Self::Example => "examples",
+            Self::Program => "programs",
+            Self::Plant => "plants",
+            Self::Guest => "guests",
+        }
+    }
+}
+
 /// One component.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Built {
@@ -92,12 +139,8 @@ pub struct Built {
     pub name: String,
     /// Where the component is.
     pub path: PathBuf,
-    /// Is it a guest for tests, not a stock controller?
-    pub guest: bool,
-    /// Is it a simulated plant?
-    pub plant: bool,
-    /// Is it a free-running program?
-    pub program: bool,
+    /// What it is for.
+    pub kind: Kind,
     /// Its size.
     pub bytes: u64,
     /// Its digest.
@@ -133,12 +176,19 @@ struct PackageMetadata {
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct ComponentMetadata {
+    #[serde(default)]
     imports: Imports,
+    /// Is it built by a script of its own (`languages`)?
+    #[serde(default)]
+    script: bool,
 }
 
-#[derive(Deserialize, Clone, Copy, PartialEq, Eq)]
+#[derive(Deserialize, Default, Clone, Copy, PartialEq, Eq)]
 #[serde(rename_all = "kebab-case")]
 enum Imports {
+    /// Only those of the interfaces.
+    #[default]
+    Ours,
     /// Imports are not checked.
     Any,
 }
@@ -159,9 +209,7 @@ struct Source {
     id: String,
     package: String,
     name: String,
-    guest: bool,
-    plant: bool,
-    program: bool,
+    kind: Kind,
     any_import: bool,
 }
 
@@ -183,26 +231,18 @@ pub fn run() -> Result<(), Error> {
     println!("{}", folder.display());
     println!("{:<28} {:>8}  sha-256", "component", "bytes");
     for c in &built {
-        let name = if c.guest {
-            format!("guests/{}", c.name)
-        } else if c.plant {
-            format!("plants/{}", c.name)
-        } else if c.program {
-            format!("programs/{}", c.name)
-        } else {
-            c.name.clone()
-        };
-        println!("{name:<28} {:>8}  {}", c.bytes, c.digest);
+        let name = Path::new(c.kind.folder()).join(&c.name);
+        println!("{:<28} {:>8}  {}", name.display(), c.bytes, c.digest);
     }
     Ok(())
 }
 
-/// Builds what is not built yet. Gives the folder and what is in it: controllers first, then guests, by name.
+/// Builds what is not built yet. Gives the folder and what is in it: by kind, then by name.
 pub fn build_all() -> Result<(PathBuf, Vec<Built>), Error> {
     let metadata = metadata()?;
     let sources = sources(&metadata);
     let folder = metadata.target_directory.join("components");
-    for inner in ["guests", "plants", "programs"].map(|name| folder.join(name)) {
+    for inner in Kind::ALL.map(|kind| folder.join(kind.folder())) {
         fs::create_dir_all(&inner).map_err(|source| Error::File {
             path: inner.clone(),
             action: "written",
@@ -231,7 +271,7 @@ pub fn build_all() -> Result<(PathBuf, Vec<Built>), Error> {
 
 /// A command in the workspace's root, without what an outer `cargo` put into the environment: flags for the host would
 /// change the guests and make cargo build them anew.
-fn command(program: &str) -> Command {
+pub(crate) fn command(program: &str) -> Command {
     let mut command = Command::new(program);
     command.current_dir(workspace_root()).stdin(Stdio::null());
     for name in [
@@ -264,7 +304,7 @@ fn metadata() -> Result<Metadata, Error> {
     serde_json::from_slice(&text).map_err(Error::Message)
 }
 
-/// The crates with a `cdylib` under `controllers`, `plants`, `programs` and `tests/guests`, in this order, by name.
+/// The crates with a `cdylib` that lie where a kind has its place, in the order of the kinds, by name.
 fn sources(metadata: &Metadata) -> Vec<Source> {
     let mut sources: Vec<Source> = metadata
         .packages
@@ -273,40 +313,50 @@ fn sources(metadata: &Metadata) -> Vec<Source> {
         .filter_map(|p| {
             let folder = p.manifest_path.parent()?;
             let place = folder.strip_prefix(&metadata.workspace_root).ok()?.parent()?;
-            let guest = place == Path::new("tests/guests");
+            let kind = Kind::ALL.into_iter().find(|kind| place == Path::new(kind.place()))?;
             let name = folder.file_name()?.to_str()?.to_owned();
             let component = p.metadata.as_ref().and_then(|m| m.component.as_ref());
             let any_import = component.is_some_and(|c| c.imports == Imports::Any);
-            let plant = place == Path::new("plants");
-            let program = place == Path::new("programs");
-            let ours = guest || plant || program || place == Path::new("controllers");
-            ours.then(|| Source {
+            if component.is_some_and(|c| c.script) {
+                return None;
+            }
+            Some(Source {
                 id: p.id.clone(),
                 package: p.name.clone(),
                 name,
-                guest,
-                plant,
-                program,
+                kind,
                 any_import,
             })
         })
         .collect();
-    sources.sort_by(|a, b| (a.guest, a.plant, a.program, &a.name).cmp(&(b.guest, b.plant, b.program, &b.name)));
+    sources.sort_by(|a, b| (a.kind, &a.name).cmp(&(b.kind, &b.name)));
     sources
 }
 
 /// Adds the wasm target through rustup where the compiler does not have it.
 pub(crate) fn ensure_target() -> Result<(), Error> {
+    ensure(TARGET)
+}
+
+/// The target whose standard library asks for an operating system.
+pub(crate) fn ensure_wasip2() -> Result<(), Error> {
+    ensure("wasm32-wasip2")
+}
+
+fn ensure(target: &'static str) -> Result<(), Error> {
     let text = output(
         "rustc",
-        command("rustc").args(["--print", "target-libdir", "--target", TARGET]),
+        command("rustc").args(["--print", "target-libdir", "--target", target]),
     )?;
     if Path::new(String::from_utf8_lossy(&text).trim()).is_dir() {
         return Ok(());
     }
-    output("rustup", command("rustup").args(["target", "add", TARGET]))
+    output("rustup", command("rustup").args(["target", "add", target]))
         .map(drop)
-        .map_err(|e| Error::Target(Box::new(e)))
+        .map_err(|e| Error::Target {
+            target,
+            source: Box::new(e),
+        })
 }
 
 /// Compiler flags, as a cargo setting that is joined with `.cargo/config.toml`: panic messages name files, and without these
@@ -362,18 +412,9 @@ fn componentize(source: &Source, modules: &[(String, PathBuf, bool)], folder: &P
         .iter()
         .find(|(id, ..)| *id == source.id)
         .ok_or_else(|| Error::NoModule(source.package.clone()))?;
-    let file = format!("{}.wasm", source.name);
-    let path = if source.guest {
-        folder.join("guests").join(file)
-    } else if source.plant {
-        folder.join("plants").join(file)
-    } else if source.program {
-        folder.join("programs").join(file)
-    } else {
-        folder.join(file)
-    };
+    let path = folder.join(source.kind.folder()).join(format!("{}.wasm", source.name));
     if !(*fresh && is_newer(&path, module)) {
-        let bytes = encode(source, &read(module)?)?;
+        let bytes = encode(&source.name, source.any_import, &read(module)?)?;
         write_whole(&path, &bytes)?;
     }
     let bytes = read(&path)?;
@@ -381,9 +422,7 @@ fn componentize(source: &Source, modules: &[(String, PathBuf, bool)], folder: &P
     Ok(Built {
         name: source.name.clone(),
         path,
-        guest: source.guest,
-        plant: source.plant,
-        program: source.program,
+        kind: source.kind,
         bytes: bytes.len() as u64,
         digest,
     })
@@ -395,7 +434,7 @@ fn is_newer(path: &Path, other: &Path) -> bool {
     matches!((time(path), time(other)), (Some(a), Some(b)) if a >= b)
 }
 
-fn read(path: &Path) -> Result<Vec<u8>, Error> {
+pub(crate) fn read(path: &Path) -> Result<Vec<u8>, Error> {
     fs::read(path).map_err(|source| Error::File {
         path: path.to_owned(),
         action: "read",
@@ -404,7 +443,7 @@ fn read(path: &Path) -> Result<Vec<u8>, Error> {
 }
 
 /// Writes beside the file, then renames: a reader sees the old or the new component, never a part of one.
-fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), Error> {
+pub(crate) fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), Error> {
     let beside = path.with_extension("wasm.new");
     fs::File::create(&beside)
         .and_then(|mut file| file.write_all(bytes))
@@ -416,9 +455,10 @@ fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), Error> {
         })
 }
 
-fn encode(source: &Source, module: &[u8]) -> Result<Vec<u8>, Error> {
+/// Makes a component of a core module.
+pub(crate) fn encode(name: &str, any_import: bool, module: &[u8]) -> Result<Vec<u8>, Error> {
     let refused = |reason: String| Error::Encode {
-        name: source.name.clone(),
+        name: name.to_owned(),
         reason,
     };
     let bytes = ComponentEncoder::default()
@@ -426,14 +466,14 @@ fn encode(source: &Source, module: &[u8]) -> Result<Vec<u8>, Error> {
         .map(|encoder| encoder.validate(true))
         .and_then(ComponentEncoder::encode)
         .map_err(|e| refused(format!("{e:#}")))?;
-    if !source.any_import {
-        check_imports(&source.name, &bytes)?;
+    if !any_import {
+        check_imports(name, &bytes)?;
     }
     Ok(bytes)
 }
 
 /// A component may import from [`PACKAGE`] alone.
-fn check_imports(name: &str, component: &[u8]) -> Result<(), Error> {
+pub(crate) fn check_imports(name: &str, component: &[u8]) -> Result<(), Error> {
     let imports = imports(component).map_err(|reason| Error::Encode {
         name: name.to_owned(),
         reason,
@@ -480,7 +520,7 @@ mod tests {
         let (folder, first) = build_all().expect("components build");
         let names: Vec<&str> = first
             .iter()
-            .filter(|c| !c.guest && !c.plant && !c.program)
+            .filter(|c| c.kind == Kind::Controller)
             .map(|c| c.name.as_str())
             .collect();
         assert_eq!(
@@ -503,7 +543,7 @@ mod tests {
                 "split-range"
             ]
         );
-        assert!(first.iter().any(|c| c.guest && c.name == "traps"));
+        assert!(first.iter().any(|c| c.kind == Kind::Guest && c.name == "traps"));
         for component in &first {
             let bytes = fs::read(&component.path).expect("is there");
             assert_eq!(Digest::of(&bytes), component.digest);

@@ -1,21 +1,24 @@
 //! Licences, sources, bans and advisories of the dependencies, by cargo-deny with `deny.toml`.
 //!
-//! Where cargo-deny is not installed it is built into `target/tools`, without optimisation: it runs for two seconds.
+//! Where cargo-deny is not installed it is built (`tool`).
 //! Advisories need the advisory database from the internet; without it they are left out, and a line says so.
-
-use std::{path::PathBuf, time::Instant};
 
 use crate::{
     Error,
-    run::{cargo, output, program, run, say, target_folder},
+    run::{output, program, run, say},
+    tool::Tool,
 };
 
-/// The version that `deny.toml` is written for.
-const VERSION: &str = "0.20.2";
+/// In the version that `deny.toml` is written for.
+const CARGO_DENY: Tool = Tool {
+    name: "cargo-deny",
+    version: "0.20.2",
+    arguments: "",
+};
 
 /// Checks all dependencies.
 pub(crate) fn check() -> Result<(), Error> {
-    let tool = tool()?;
+    let tool = CARGO_DENY.path()?;
     run(program(&tool).args([
         "--all-features",
         "--log-level",
@@ -37,34 +40,4 @@ pub(crate) fn check() -> Result<(), Error> {
     }
     say("advisories: NOT checked, the advisory database (github.com/rustsec/advisory-db) cannot be fetched from here");
     Ok(())
-}
-
-/// An installed cargo-deny, or one that is built now.
-fn tool() -> Result<PathBuf, Error> {
-    let own = target_folder().join("tools");
-    for path in [PathBuf::from("cargo-deny"), own.join("bin/cargo-deny")] {
-        if output(program(&path).arg("--version")).is_some_and(|text| text.ends_with(VERSION)) {
-            return Ok(path);
-        }
-    }
-    say(&format!(
-        "cargo-deny {VERSION} is not installed: building it into {}",
-        own.display()
-    ));
-    let start = Instant::now();
-    // A target folder of its own, kept small: the tool shares no build with the project.
-    let build = own.join("build");
-    run(cargo("install cargo-deny --locked --debug --quiet --version")
-        .arg(VERSION)
-        .arg("--root")
-        .arg(&own)
-        .arg("--target-dir")
-        .arg(&build)
-        .env("CARGO_PROFILE_DEV_DEBUG", "0"))?;
-    let removed = std::fs::remove_dir_all(&build);
-    if let Err(source) = removed {
-        return Err(Error::File { path: build, source });
-    }
-    say(&format!("built in {:.0} s", start.elapsed().as_secs_f64()));
-    Ok(own.join("bin/cargo-deny"))
 }

@@ -34,6 +34,19 @@ pub enum Error {
         /// What the system says.
         source: io::Error,
     },
+    /// The interfaces.
+    #[error("wit/: {0}")]
+    Wit(String),
+    /// An example in another language does not build.
+    #[error("examples/{name}: `{command}` failed; it said:\n{said}")]
+    Example {
+        /// Its folder.
+        name: String,
+        /// What was run.
+        command: String,
+        /// The end of what it wrote.
+        said: String,
+    },
     /// A step of the checks failed.
     #[error("the step {step:?} failed")]
     Step {

@@ -2,13 +2,19 @@
 //!
 //! Never: a part of the product.
 
+pub mod bindings;
+pub mod book;
 pub mod check;
 pub mod components;
+pub mod languages;
 pub mod page;
 pub mod product;
+pub mod reference;
 
 mod deny;
 mod error;
 mod run;
+mod stub;
+mod tool;
 
 pub use error::Error;

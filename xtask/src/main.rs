@@ -1,9 +1,9 @@
 //! `cargo xtask <what>`: sets up, builds and checks. Owns the command line; the work is in the library.
 
-use std::process::ExitCode;
+use std::{path::PathBuf, process::ExitCode};
 
 use clap::Parser;
-use xtask::{Error, check, components, page, product};
+use xtask::{Error, bindings, book, check, components, languages, page, product, reference};
 
 /// Sets up, builds and checks Bumpless.
 #[derive(Parser)]
@@ -11,6 +11,28 @@ use xtask::{Error, check, components, page, product};
 enum Command {
     /// Builds the controllers and the test guests into components under target/components.
     Components,
+    /// Builds the example law in every language into target/components/examples: `cargo xtask languages [NAME…]`.
+    Languages {
+        /// Folders of examples/, for example `c-pid`; all where none is named.
+        names: Vec<String>,
+    },
+    /// Writes what a law in another language needs of wit/ into a folder.
+    Bindings {
+        /// The language.
+        language: BindingsOf,
+        /// The folder.
+        folder: PathBuf,
+    },
+    /// Makes a component of a core module that carries the types of its world, and refuses imports that are not ours.
+    Component {
+        /// The module.
+        module: PathBuf,
+        /// The component.
+        out: PathBuf,
+        /// Puts traps in the place of what the module imports of WASI.
+        #[arg(long)]
+        stub_wasi: bool,
+    },
     /// Sets up what is missing and runs everything that has to hold: format, dependencies, lints, build, tests, documentation.
     Test {
         /// Leaves out what takes minutes: the dependency check, end-to-end tests, documentation.
@@ -46,11 +68,28 @@ enum Command {
     Page,
     /// Writes docs/openapi.json from the code.
     Openapi,
+    /// Writes docs/book/wit.md from the interfaces.
+    Wit,
+    /// Builds the book of docs/ into target/book, with mdBook, which is built first where it is not installed.
+    Book,
+}
+
+/// A language whose bindings this tool writes; the others have tools of their own.
+#[derive(Clone, Copy, clap::ValueEnum)]
+enum BindingsOf {
+    /// C.
+    C,
 }
 
 fn main() -> ExitCode {
     let done = match Command::parse() {
         Command::Components => components::run().map_err(Error::from),
+        Command::Languages { names } => languages::run(&names),
+        Command::Bindings {
+            language: BindingsOf::C,
+            folder,
+        } => bindings::c(&folder),
+        Command::Component { module, out, stub_wasi } => bindings::component(&module, &out, stub_wasi),
         Command::Test { fast } => check::test(fast),
         Command::Demo { arguments } => product::demo(&arguments),
         Command::Bench { arguments } => product::bench(&arguments),
@@ -58,6 +97,8 @@ fn main() -> ExitCode {
         Command::Simulate { arguments } => product::tool("bumpless-simulation", &arguments),
         Command::Page => page::build(),
         Command::Openapi => product::openapi(),
+        Command::Wit => reference::write(),
+        Command::Book => book::build(),
     };
     match done {
         Ok(()) => ExitCode::SUCCESS,

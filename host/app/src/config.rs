@@ -450,7 +450,7 @@ impl EngineTable {
         )?;
         limits.compile_memory_bytes_max = child_mib * 1024 * 1024;
         limits.compile_time_max =
-            Duration::from_secs(in_range(wrong, "engine.compile_s_max", self.compile_s_max, 60, 1, 60)?);
+            Duration::from_secs(in_range(wrong, "engine.compile_s_max", self.compile_s_max, 60, 1, 180)?);
         config.compile = match self.compile.unwrap_or(CompileWord::Child) {
             CompileWord::InProcess => bumpless_engine::Compile::InProcess,
             CompileWord::Child => bumpless_engine::Compile::Child {

@@ -19,7 +19,7 @@ pub enum Error {
         source: io::Error,
     },
     /// Nothing that can be built.
-    #[error("{path} is no source of a controller: give a .st file, a folder with one, or a folder with a Cargo.toml", path = path.display())]
+    #[error("{path} is no source of a controller: give a .st file, a folder with one, or a folder with a Cargo.toml or a build.sh", path = path.display())]
     NoSource {
         /// Which.
         path: PathBuf,
@@ -47,6 +47,20 @@ pub enum Error {
         program: &'static str,
         /// What it wrote.
         output: String,
+    },
+    /// There is no shell.
+    #[error("{program} cannot be run: {source}; a build.sh needs a shell on the path")]
+    NoShell {
+        /// Its name.
+        program: &'static str,
+        /// What the system says.
+        source: io::Error,
+    },
+    /// A script ended well and left nothing.
+    #[error("{path}: build.sh left no component: it writes the file that its first argument names", path = path.display())]
+    NoOutput {
+        /// The project's folder.
+        path: PathBuf,
     },
     /// Cargo built something else.
     #[error("{path}: cargo built no module: give the crate `crate-type = [\"cdylib\", \"rlib\"]`", path = path.display())]

@@ -2,13 +2,16 @@
 //!
 //! ```text
 //!   loop.st ───────────── bumpless-st ──────────────────────┐
-//!   folder with Cargo.toml ─ cargo (wasm32) ─ wit-component ─┴─► component
+//!   folder with Cargo.toml ─ cargo (wasm32) ─ wit-component ─┼─► component
+//!   folder with build.sh ─── sh ─ (wit-component) ───────────┘
 //! ```
 //! Owns: templates of projects, the way from a source to a component's bytes. Never: speaks to a cell or runs a component.
 
+mod bindings;
 mod cargo;
 mod error;
 mod project;
+mod script;
 mod state;
 mod watch;
 
@@ -34,7 +37,8 @@ pub struct Built {
     pub source: PathBuf,
 }
 
-/// Builds what lies at a path: a text (`.st`), a folder with one, or a folder with a `Cargo.toml`.
+/// Builds what lies at a path: a text (`.st`), a folder with one, a folder with a `Cargo.toml`, or one with a
+/// `build.sh`.
 ///
 /// `version` stands for the one in the source: the library of a cell keeps each version once, and an author builds many.
 ///
@@ -74,6 +78,7 @@ fn build_as(path: &Path, version: Option<&str>, lines: bool) -> Result<Built, Er
             })
         }
         Source::Crate(folder) => cargo::build(&folder, version, lines),
+        Source::Script(folder) => script::build(&folder, version),
     }
 }
 
@@ -81,6 +86,7 @@ fn build_as(path: &Path, version: Option<&str>, lines: bool) -> Result<Built, Er
 enum Source {
     Text(PathBuf),
     Crate(PathBuf),
+    Script(PathBuf),
 }
 
 fn is_text(path: &Path) -> bool {
@@ -98,6 +104,9 @@ fn source(path: &Path) -> Result<Source, Error> {
     }
     if path.join("Cargo.toml").is_file() {
         return Ok(Source::Crate(path.to_owned()));
+    }
+    if path.join(script::SCRIPT).is_file() {
+        return Ok(Source::Script(path.to_owned()));
     }
     let entries = fs::read_dir(path).map_err(|source| Error::file(path, "read", source))?;
     let mut texts: Vec<PathBuf> = entries
@@ -133,6 +142,38 @@ mod tests {
                 .to_string()
                 .ends_with("level-loop is there already: choose another name"),
             "{again}"
+        );
+    }
+
+    #[test]
+    fn projects_in_other_languages_are_whole_and_have_a_name_of_their_own() {
+        let folder = tempfile::tempdir().unwrap();
+        for (language, example, law) in [
+            (Language::C, "c-pid", "component.c"),
+            (Language::Js, "js-pid", "law.js"),
+            (Language::Ts, "ts-pid", "law.ts"),
+            (Language::Python, "python-pid", "law.py"),
+        ] {
+            let name = format!("my-{}", &example[..example.len() - 4]);
+            let project = create(language, folder.path(), &name, None).unwrap();
+            let text = |file: &str| fs::read_to_string(project.join(file)).unwrap();
+            assert!(text(law).contains(&format!("\"{name}\"")), "{example}");
+            assert!(!text(law).contains(&format!("\"{example}\"")), "{example}");
+            // What `build.sh` puts the version of a build in the place of.
+            assert_eq!(text(law).matches("\"0.1.0\"").count(), 1, "{example}");
+            for file in ["README.md", "build.sh", "loop.toml", "experiment.toml", "host.toml"] {
+                assert!(!text(file).contains('@'), "{example}, {file}: {}", text(file));
+            }
+            assert!(text("loop.toml").contains("gain = 1.5") && text("experiment.toml").contains("gain = 1.5"));
+            assert!(text("wit/control.wit").contains("world controller"));
+            assert!(text(".gitignore").ends_with("__pycache__\n"));
+            assert!(matches!(source(&project).unwrap(), Source::Script(_)));
+        }
+        assert!(
+            folder
+                .path()
+                .join("my-c/bindings/controller_component_type.o")
+                .is_file()
         );
     }
 

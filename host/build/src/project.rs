@@ -9,6 +9,10 @@ use std::{
 
 use crate::Error;
 
+mod foreign;
+
+use foreign::Foreign;
+
 /// What a controller is written in.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Language {
@@ -16,6 +20,14 @@ pub enum Language {
     Rust,
     /// Structured Text (IEC 61131-3).
     St,
+    /// C, by clang.
+    C,
+    /// JavaScript, in QuickJS.
+    Js,
+    /// TypeScript, in QuickJS.
+    Ts,
+    /// Python, in CPython.
+    Python,
 }
 
 const RUST: [(&str, &str); 7] = [
@@ -37,6 +49,13 @@ const ST: [(&str, &str); 6] = [
     ("README.md", include_str!("templates/st.md")),
 ];
 
+fn own(files: &[(&str, &str)]) -> Vec<(String, Vec<u8>)> {
+    files
+        .iter()
+        .map(|(file, text)| ((*file).to_owned(), text.as_bytes().to_vec()))
+        .collect()
+}
+
 /// Makes the folder `name` in `parent` with a whole project. `sdk` is the folder `guest-sdk`, which projects in Rust need.
 ///
 /// # Errors
@@ -49,32 +68,38 @@ pub fn create(language: Language, parent: &Path, name: &str, sdk: Option<&Path>)
     if !letters || !first || name.len() > 32 || name.contains("--") || name.ends_with('-') {
         return Err(Error::Name(name.to_owned()));
     }
-    let files: &[(&str, &str)] = match language {
-        Language::Rust => &RUST,
-        Language::St => &ST,
-    };
     let sdk = match (language, sdk) {
-        (Language::St, _) => String::new(),
         (Language::Rust, Some(sdk)) => {
             let whole = fs::canonicalize(sdk).map_err(|source| Error::file(sdk, "read", source))?;
             whole.display().to_string()
         }
         (Language::Rust, None) => return Err(Error::NoSdk),
+        _ => String::new(),
+    };
+    let files = match Foreign::of(language) {
+        Some(foreign) => foreign.files(name)?,
+        None => own(if language == Language::Rust { &RUST } else { &ST }),
     };
     let folder = parent.join(name);
     if folder.exists() {
         return Err(Error::Exists { path: folder });
     }
     let word = name.replace('-', "_");
-    for (file, text) in files {
+    for (file, bytes) in files {
         let path = folder.join(file.replace("NAME", &word));
         let above = path.parent().unwrap_or(&folder);
         fs::create_dir_all(above).map_err(|source| Error::file(above, "made", source))?;
-        let text = text
-            .replace("@NAME@", name)
-            .replace("@WORD@", &word)
-            .replace("@SDK@", &sdk.replace('\\', "\\\\"));
-        fs::write(&path, text).map_err(|source| Error::file(&path, "written", source))?;
+        // Generated bindings have a part that is no text.
+        let bytes = String::from_utf8(bytes).map_or_else(
+            |no_text| no_text.into_bytes(),
+            |text| {
+                text.replace("@NAME@", name)
+                    .replace("@WORD@", &word)
+                    .replace("@SDK@", &sdk.replace('\\', "\\\\"))
+                    .into_bytes()
+            },
+        );
+        fs::write(&path, bytes).map_err(|source| Error::file(&path, "written", source))?;
     }
     // The versions that the SDK is tested with: the project builds the same tomorrow, and without a network where they are here.
     let (lock, own) = (Path::new(&sdk).join("../Cargo.lock"), folder.join("Cargo.lock"));

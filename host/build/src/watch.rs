@@ -26,9 +26,9 @@ const FOLDERS_MAX: usize = 1_000;
 /// Levels of folders.
 const DEPTH_MAX: u32 = 12;
 /// Ends of names that belong to a source.
-const ENDS: [&str; 4] = ["st", "rs", "toml", "wit"];
+const ENDS: [&str; 11] = ["st", "rs", "toml", "wit", "c", "h", "js", "ts", "json", "py", "sh"];
 /// Folders with what is built or fetched.
-const PASSED: [&str; 3] = ["target", ".git", "node_modules"];
+const PASSED: [&str; 6] = ["target", ".git", "node_modules", "build", "venv", "__pycache__"];
 /// Quiet after which a save counts as whole: an editor writes several files, or one in parts.
 const SETTLED: Duration = Duration::from_millis(30);
 /// Longest time that is waited for that quiet.

@@ -1,13 +1,13 @@
 //! What a component costs on this machine: compile, load, instantiate, step; memory and memory maps of an instance.
 //!
-//! Run by hand: `cargo run -p bumpless-engine --example step_cost -- COMPONENT.wasm [STEPS] [INSTANCES]`.
+//! Run by hand: `cargo run -p bumpless-engine --example step_cost -- COMPONENT.wasm [STEPS] [INSTANCES] [MEMORY_MIB]`.
 //! Only a release build's figures mean anything; compare figures of one run, for machines are noisy.
 #![allow(clippy::print_stdout, reason = "a program for people")]
 
 use std::{path::Path, process::ExitCode, time::Instant};
 
 use bumpless_core::{Cycle, Direction, Frame, Mode, Reading};
-use bumpless_engine::{Config, Engine};
+use bumpless_engine::{Config, Engine, Limits};
 
 /// Longest call, in ns: this program measures and does not judge.
 const LIMIT_NS: u64 = 1_000_000_000;
@@ -15,11 +15,11 @@ const LIMIT_NS: u64 = 1_000_000_000;
 fn main() -> ExitCode {
     let mut args = std::env::args().skip(1);
     let Some(path) = args.next() else {
-        println!("usage: step_cost COMPONENT.wasm [STEPS] [INSTANCES]");
+        println!("usage: step_cost COMPONENT.wasm [STEPS] [INSTANCES] [MEMORY_MIB]");
         return ExitCode::FAILURE;
     };
     let mut number = |default| args.next().and_then(|text| text.parse().ok()).unwrap_or(default);
-    match measure(path.as_ref(), number(100_000), number(1000)) {
+    match measure(path.as_ref(), number(100_000), number(1000), number(16)) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             println!("{error}");
@@ -28,11 +28,15 @@ fn main() -> ExitCode {
     }
 }
 
-fn measure(path: &Path, steps: usize, instances: usize) -> Result<(), Box<dyn std::error::Error>> {
+fn measure(path: &Path, steps: usize, instances: usize, memory_mib: usize) -> Result<(), Box<dyn std::error::Error>> {
     let bytes = std::fs::read(path)?;
     let instances_max = u32::try_from(instances)?.max(2);
     let engine = Engine::new(Config {
         instances_max,
+        limits: Limits {
+            memory_bytes_max: memory_mib * 1024 * 1024,
+            ..Limits::default()
+        },
         ..Config::default()
     })?;
     let found = engine.inspect(&bytes)?;

@@ -9,8 +9,11 @@ use wasmtime::component::{Component, types::ComponentItem};
 
 use crate::{
     Error, Limits,
-    sandbox::{MEMORIES_MAX, TABLES_MAX},
+    sandbox::{MEMORIES_MAX, MEMORIES_PER_PLACE, TABLES_MAX},
 };
+
+/// As [`MEMORIES_PER_PLACE`].
+const PER_PLACE: u32 = MEMORIES_PER_PLACE as u32;
 
 /// The package of the interfaces.
 const PACKAGE: &str = "bumpless:control/";
@@ -104,7 +107,7 @@ fn check_imports_of(component: &Component, offered: &[&str]) -> Result<Vec<Strin
 
 fn cure(name: &str) -> &'static str {
     if name.starts_with("wasi:") {
-        "a controller has no operating system: build it for wasm32-unknown-unknown, not for wasm32-wasip2"
+        "a controller has no operating system: build it for wasm32-unknown-unknown, or put traps in the place of WASI (docs/book/languages.md)"
     } else if name.starts_with(PACKAGE) {
         "this host does not know the interface; it may be of a newer version"
     } else {
@@ -156,8 +159,9 @@ fn check_interface(component: &Component, export: &str, functions: &[&str]) -> R
     Ok(())
 }
 
-/// Memories and tables within what an instance may have.
-pub(crate) fn check_needs(component: &Component, limits: &Limits) -> Result<(), Error> {
+/// Memories and tables within what an instance may have. Gives the places that one takes: 1, or more where it has many
+/// memories.
+pub(crate) fn check_needs(component: &Component, limits: &Limits) -> Result<u32, Error> {
     let needs = |reason: String| Err(Error::Needs { reason });
     let Some(needed) = component.resources_required() else {
         return needs("it imports core modules, so what it needs cannot be known".to_owned());
@@ -186,7 +190,7 @@ pub(crate) fn check_needs(component: &Component, limits: &Limits) -> Result<(), 
             "a table of {elements} elements; at most {elements_max} are given"
         ));
     }
-    Ok(())
+    Ok(needed.num_memories.div_ceil(PER_PLACE).max(1))
 }
 
 #[cfg(test)]

@@ -31,7 +31,10 @@ pub(crate) struct Places {
 
 /// One instance's right to exist; given back on drop.
 #[derive(Debug)]
-pub(crate) struct Place(Arc<AtomicU32>);
+pub(crate) struct Place {
+    used: Arc<AtomicU32>,
+    weight: u32,
+}
 
 impl Places {
     pub(crate) fn new(max: u32) -> Self {
@@ -41,13 +44,16 @@ impl Places {
         }
     }
 
-    /// A place, or [`Error::Full`].
-    pub(crate) fn take(&self) -> Result<Place, Error> {
+    /// A place, or several for an instance that needs the slots of several; or [`Error::Full`].
+    pub(crate) fn take(&self, weight: u32) -> Result<Place, Error> {
         self.used
             .fetch_update(Ordering::Relaxed, Ordering::Relaxed, |used| {
-                (used < self.max).then_some(used + 1)
+                used.checked_add(weight).filter(|&used| used <= self.max)
             })
-            .map(|_| Place(Arc::clone(&self.used)))
+            .map(|_| Place {
+                used: Arc::clone(&self.used),
+                weight,
+            })
             .map_err(|_| Error::Full { max: self.max })
     }
 
@@ -61,7 +67,7 @@ impl Places {
 
 impl Drop for Place {
     fn drop(&mut self) {
-        self.0.fetch_sub(1, Ordering::Relaxed);
+        self.used.fetch_sub(self.weight, Ordering::Relaxed);
     }
 }
 
@@ -125,10 +131,11 @@ mod tests {
     #[test]
     fn places_are_refused_beyond_the_limit_and_come_back() {
         let places = Places::new(2);
-        let first = places.take().unwrap();
-        let _second = places.take().unwrap();
+        assert!(places.take(3).is_err(), "one that is too large for all of them");
+        let first = places.take(1).unwrap();
+        let _second = places.take(1).unwrap();
         assert_eq!(
-            places.take().unwrap_err().to_string(),
+            places.take(1).unwrap_err().to_string(),
             "all 2 instances of this host are in use; stop a loop or raise the host's instance limit"
         );
         drop(first);
@@ -139,7 +146,8 @@ mod tests {
                 instances_used: 1
             }
         );
-        assert!(places.take().is_ok());
+        assert!(places.take(2).is_err());
+        assert!(places.take(1).is_ok());
     }
 
     #[test]

@@ -170,6 +170,8 @@ pub struct PreparedPlant {
     digest: Digest,
     info: PlantInfo,
     imports: Vec<String>,
+    /// Places that an instance takes.
+    weight: u32,
     pre: PlantPre<Sandbox>,
 }
 
@@ -178,7 +180,7 @@ impl PreparedPlant {
     pub(crate) fn new(core: Arc<Core>, digest: Digest, component: &Component) -> Result<Self, Error> {
         let imports = check_imports(component)?;
         check_plant_export(component)?;
-        check_needs(component, &core.limits)?;
+        let weight = check_needs(component, &core.limits)?;
         let world = |error: wasmtime::Error| Error::PlantWorld { reason: brief(&error) };
         let pre = PlantPre::new(core.linker.instantiate_pre(component).map_err(world)?).map_err(world)?;
         let info = describe(&core, &pre)?;
@@ -188,6 +190,7 @@ impl PreparedPlant {
             digest,
             info,
             imports,
+            weight,
             pre,
         })
     }
@@ -215,7 +218,7 @@ impl PreparedPlant {
     /// # Errors
     /// [`Error::Full`] where the host has no place left, [`Error::Instantiate`] where the guest fails at its start.
     pub fn instantiate(self: &Arc<Self>) -> Result<PlantInstance, Error> {
-        let place = self.core.places.take()?;
+        let place = self.core.places.take(self.weight)?;
         let limit = self.core.limits.describe_time_max;
         let (store, guest) = live(&self.core, &self.pre, limit)?;
         Ok(PlantInstance {

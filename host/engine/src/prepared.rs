@@ -60,6 +60,8 @@ pub struct Prepared {
     descriptor: Descriptor,
     ports: Arc<[PortFace]>,
     imports: Vec<String>,
+    /// Places that an instance takes.
+    weight: u32,
     pre: ControllerPre<Sandbox>,
 }
 
@@ -68,7 +70,7 @@ impl Prepared {
     pub(crate) fn new(core: Arc<Core>, digest: Digest, component: &Component) -> Result<Self, Error> {
         let imports = check_imports(component)?;
         check_export(component)?;
-        check_needs(component, &core.limits)?;
+        let weight = check_needs(component, &core.limits)?;
         let world = |error: wasmtime::Error| Error::World { reason: brief(&error) };
         let pre = ControllerPre::new(core.linker.instantiate_pre(component).map_err(world)?).map_err(world)?;
         let descriptor = describe(&core, &pre)?;
@@ -80,6 +82,7 @@ impl Prepared {
             descriptor,
             ports,
             imports,
+            weight,
             pre,
         })
     }
@@ -112,7 +115,7 @@ impl Prepared {
     /// # Errors
     /// [`Error::Full`] where the host has no place left, [`Error::Instantiate`] where the guest fails at its start.
     pub fn instantiate(self: &Arc<Self>) -> Result<Instance, Error> {
-        let place = self.core.places.take()?;
+        let place = self.core.places.take(self.weight)?;
         let limit = self.core.limits.describe_time_max;
         let live = self
             .make(monotonic_ns(), nanos(limit))
@@ -125,7 +128,7 @@ impl Prepared {
     /// # Errors
     /// [`Error::Busy`] where others are being tried, [`Error::Instantiate`] where the guest fails at its start.
     pub fn instantiate_for_trial(self: &Arc<Self>) -> Result<Instance, Error> {
-        let place = self.core.trials.take().map_err(|_| Error::Busy {
+        let place = self.core.trials.take(self.weight).map_err(|_| Error::Busy {
             doing: "tried",
             waited_s: 0,
         })?;

@@ -11,16 +11,16 @@ use crate::{
     Error,
     config::Limits,
     error::brief,
-    sandbox::{CORE_INSTANCES_MAX, MEMORIES_MAX, TABLES_MAX},
+    sandbox::{CORE_INSTANCES_MAX, MEMORIES_MAX, MEMORIES_PER_PLACE, TABLES_MAX},
 };
 
 /// Instances up to which slots are reserved ahead: no `mmap` beside running cycles, and a new instance in about 1 µs.
 /// Beyond it the maps of the slots would not fit into the kernel's default of 65,530.
 const POOLED_INSTANCES_MAX: u32 = 14_000;
 
-/// Memory maps of one pooled instance: of each memory the part in use and the part still closed. Measured with 8,000
+/// Memory maps of one place: of each memory the part in use and the part still closed. Measured with 8,000
 /// instances of a component with one memory: 2 each.
-const MAPS_PER_POOLED_INSTANCE: usize = 2 * MEMORIES_MAX;
+const MAPS_PER_POOLED_INSTANCE: usize = 2 * MEMORIES_PER_PLACE;
 /// Memory maps of one prepared component: code, read-only data, and what lies between.
 const MAPS_PER_COMPONENT: usize = 6;
 /// Memory maps left to the rest of the process: thread stacks, allocator arenas, the bus, the database.
@@ -28,11 +28,11 @@ const MAPS_OF_OTHERS: usize = 4096;
 
 /// Components that say what they are at once.
 pub(crate) const INSPECTED_AT_ONCE: u32 = 4;
-/// Instances of components that are being tried: one that is used and one that is fresh, and as many again for those that
-/// are just being dropped.
-pub(crate) const TRIAL_INSTANCES: u32 = 4;
+/// Places for instances of components that are being tried: one that is used and one that is fresh, as many again for those that
+/// are just being dropped, and two places each.
+pub(crate) const TRIAL_INSTANCES: u32 = 8;
 /// Slots beyond the instances that loops may have.
-const SPARE_INSTANCES: u32 = INSPECTED_AT_ONCE + TRIAL_INSTANCES;
+const SPARE_INSTANCES: u32 = 2 * INSPECTED_AT_ONCE + TRIAL_INSTANCES;
 
 /// Stack of a guest in bytes; a thread that steps must have 1 MiB or more in all.
 const STACK_BYTES_MAX: usize = 256 * 1024;
@@ -116,7 +116,8 @@ impl Profile {
             .concurrency_support(false)
             .gc_support(false)
             .wasm_memory64(false)
-            .wasm_multi_memory(false)
+            // What joins two components of one, as those of an interpreter with its stubs, copies from memory to memory.
+            .wasm_multi_memory(true)
             // Nothing is put off until it is first used: that would be in a cycle.
             .table_lazy_init(false)
             .memory_init_cow(false)
@@ -196,7 +197,7 @@ fn pool(instances_max: u32, limits: &Limits) -> PoolingAllocationConfig {
     let mut pool = PoolingAllocationConfig::new();
     pool.total_component_instances(instances)
         .total_core_instances(times(CORE_INSTANCES_MAX))
-        .total_memories(times(MEMORIES_MAX))
+        .total_memories(times(MEMORIES_PER_PLACE))
         .total_tables(times(TABLES_MAX))
         .max_core_instances_per_component(u32::try_from(CORE_INSTANCES_MAX).unwrap_or(u32::MAX))
         .max_memories_per_component(u32::try_from(MEMORIES_MAX).unwrap_or(u32::MAX))

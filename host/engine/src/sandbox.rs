@@ -21,11 +21,15 @@ use wasmtime::{ResourceLimiter, Trap};
 
 use crate::{config::Limits, place, ticker::monotonic_ns};
 
-/// Core instances, memories and tables of one component. A Rust component has 3, 1 and 2; composed ones have more.
-pub(crate) const CORE_INSTANCES_MAX: usize = 8;
-/// See [`CORE_INSTANCES_MAX`].
-pub(crate) const MEMORIES_MAX: usize = 2;
-/// See [`CORE_INSTANCES_MAX`].
+/// Core instances of one component. A Rust component has 3; an interpreter comes as many modules linked to each other, CPython
+/// as 38. A core instance is some KiB of bookkeeping, allocated as it is made; what it may hold, memories and tables bound.
+pub(crate) const CORE_INSTANCES_MAX: usize = 48;
+/// Memories of one component. A Rust component has 1; one that is composed of others has one of each: a JavaScript one has 3,
+/// two of them empty. All of them together are within the memory of one instance.
+pub(crate) const MEMORIES_MAX: usize = 4;
+/// Memories for which a place among the instances pays; a component with more of them takes several places.
+pub(crate) const MEMORIES_PER_PLACE: usize = 2;
+/// Tables of one component. A Rust component has 2, a JavaScript one 3.
 pub(crate) const TABLES_MAX: usize = 4;
 
 /// Bytes that one call may move from the guest to the host: the largest state with room for a descriptor's texts.
@@ -285,11 +289,13 @@ pub(crate) fn cut(text: &str) -> String {
 
 impl ResourceLimiter for Sandbox {
     fn memory_growing(&mut self, current: usize, desired: usize, _maximum: Option<usize>) -> wasmtime::Result<bool> {
-        let fits = desired <= self.memory_bytes_max;
+        // Of all memories together: which of them it is, nobody says.
+        let whole = self.memory_bytes.saturating_add(desired.saturating_sub(current));
+        let fits = whole <= self.memory_bytes_max;
         if fits {
-            self.memory_bytes = self.memory_bytes.saturating_add(desired.saturating_sub(current));
+            self.memory_bytes = whole;
         } else {
-            self.refused = Some(Refused::Memory(desired));
+            self.refused = Some(Refused::Memory(whole));
         }
         Ok(fits)
     }
@@ -322,6 +328,17 @@ mod tests {
 
     fn sandbox() -> Sandbox {
         Sandbox::new(&Limits::default(), Arc::from([]), monotonic_ns())
+    }
+
+    #[test]
+    fn all_memories_of_an_instance_share_one_limit() {
+        let (mut sandbox, max) = (sandbox(), Limits::default().memory_bytes_max);
+        assert!(sandbox.memory_growing(0, max / 2, None).unwrap());
+        assert!(sandbox.memory_growing(0, max / 4, None).unwrap());
+        assert!(!sandbox.memory_growing(max / 4, max * 3 / 4, None).unwrap());
+        assert!(sandbox.memory_growing(max / 4, max / 2, None).unwrap());
+        assert_eq!(sandbox.memory_bytes(), max);
+        assert!(!sandbox.memory_growing(0, 65_536, None).unwrap());
     }
 
     #[test]

@@ -26,12 +26,20 @@ pub(crate) enum LanguageWord {
     Rust,
     /// Structured Text (IEC 61131-3).
     St,
+    /// C, by clang.
+    C,
+    /// JavaScript.
+    Js,
+    /// TypeScript.
+    Ts,
+    /// Python.
+    Python,
 }
 
 /// A build.
 #[derive(Debug, Args)]
 pub(crate) struct BuildArgs {
-    /// A text (.st), a folder with one, or a folder with a Cargo.toml.
+    /// A text (.st), a folder with one, a folder with a Cargo.toml, or one with a build.sh.
     pub(crate) source: PathBuf,
     /// The component's file; beside the source where not given.
     #[arg(long, short, value_name = "FILE")]

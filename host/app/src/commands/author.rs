@@ -25,6 +25,10 @@ pub(crate) fn new(args: &NewArgs) -> Result<(), Error> {
     let language = match args.language {
         LanguageWord::Rust => Language::Rust,
         LanguageWord::St => Language::St,
+        LanguageWord::C => Language::C,
+        LanguageWord::Js => Language::Js,
+        LanguageWord::Ts => Language::Ts,
+        LanguageWord::Python => Language::Python,
     };
     let sdk = args.sdk.clone().or_else(bumpless_build::sdk_near);
     let folder = bumpless_build::create(language, Path::new(""), &args.name, sdk.as_deref()).map_err(failed)?;

@@ -1,7 +1,7 @@
 //! What is taken and what is refused, with the words that the uploader reads.
 
 use bumpless_core::{Digest, Direction};
-use bumpless_engine::{Config, Engine, Error, Limits};
+use bumpless_engine::{Config, Engine, Error, Limits, Profile, precompile};
 
 use crate::guest::{Guest, engine};
 
@@ -116,19 +116,14 @@ fn what_is_no_controller_is_refused_in_words() {
                  (export "bumpless:control/control@0.1.0" (instance $c)))"#
         ))
     };
-    let many = exporting(&"(core instance (instantiate $e))".repeat(8));
-    let memories = exporting(&"(core instance (instantiate $mem))".repeat(3));
+    let many = exporting(&"(core instance (instantiate $e))".repeat(48));
+    let memories = exporting(&"(core instance (instantiate $mem))".repeat(5));
     let hungry = Guest {
         pages: 300,
         ..Guest::good()
     }
     .build();
-    let precompiled = bumpless_engine::precompile(
-        &Guest::good().build(),
-        bumpless_engine::Profile::Pooled,
-        &Limits::default(),
-    )
-    .unwrap();
+    let precompiled = precompile(&Guest::good().build(), Profile::Pooled, &Limits::default()).unwrap();
 
     let cases: [(&str, &[u8], &str); 19] = [
         ("garbage", b"MZ\x90", "no WebAssembly component but something else"),
@@ -270,4 +265,38 @@ fn settings_that_make_no_sense_are_refused() {
         }),
         "engine setting prepared_max = 0: use 1 or more"
     );
+}
+
+#[test]
+fn a_component_of_several_with_memories_of_their_own_compiles() {
+    // The text goes from one memory to the other, by an adapter that knows both.
+    let joined = wat::parse_str(
+        r#"(component
+             (component $inner
+               (core module $m
+                 (memory (export "memory") 1)
+                 (func (export "length") (param i32 i32) (result i32) local.get 1)
+                 (func (export "realloc") (param i32 i32 i32 i32) (result i32) i32.const 0))
+               (core instance $i (instantiate $m))
+               (func (export "length") (param "text" string) (result u32)
+                 (canon lift (core func $i "length") (memory (core memory $i "memory")) (realloc (core func $i "realloc")))))
+             (component $outer
+               (import "length" (func $length (param "text" string) (result u32)))
+               (core module $memory (memory (export "memory") 1))
+               (core instance $own (instantiate $memory))
+               (core func $lowered (canon lower (func $length) (memory (core memory $own "memory"))))
+               (core module $m
+                 (import "inner" "length" (func $length (param i32 i32) (result i32)))
+                 (func (export "run") (result i32) (call $length (i32.const 0) (i32.const 3))))
+               (core instance $i (instantiate $m (with "inner" (instance (export "length" (func $lowered))))))
+               (func (export "run") (result u32) (canon lift (core func $i "run"))))
+             (instance $one (instantiate $inner))
+             (instance $two (instantiate $outer (with "length" (func $one "length"))))
+             (export "run" (func $two "run")))"#,
+    )
+    .unwrap();
+    for profile in [Profile::Pooled, Profile::OnDemand] {
+        let compiled = precompile(&joined, profile, &Limits::default());
+        assert!(compiled.is_ok(), "{profile:?}: {:?}", compiled.err());
+    }
 }

@@ -1,0 +1,13 @@
+#!/bin/sh
+# Builds a component of law.ts: sh build.sh [OUT]. BUILD is where the JavaScript goes; TOOLS names the folder with tsc and
+# componentize-qjs where npm installed elsewhere. A copy of this folder elsewhere has the interfaces in it, as wit/.
+set -eu
+cd "$(dirname "$0")"
+wit=../../wit
+if [ -d wit ]; then wit=wit; fi
+PATH="${TOOLS:-$PWD/node_modules/.bin}:$PATH"
+build="${BUILD:-build}"
+tsc --outDir "$build/js"
+# QuickJS with its libc asks for WASI, and a controller has no operating system: --stub-wasi puts traps in its place.
+# --sync: the host calls without the component model's async.
+componentize-qjs --wit "$wit" --world controller --sync --stub-wasi --js "$build/js/law.js" --output "${1:-ts-pid.wasm}"
