@@ -31,6 +31,7 @@
 //! | stock | every stock law passes its trial |
 //! | lab | virtual time against a live cell, and the ways between the two; plants as components |
 //! | guides | the commands in the documentation |
+//! | operations | dry runs, systemd, safe outputs at a stop, backup and restore |
 //! | house | the rules of the source itself |
 
 #![allow(
@@ -59,6 +60,7 @@ mod masters;
 mod members;
 mod modbus;
 mod neighbours;
+mod operations;
 mod past;
 mod phases;
 mod recovery;

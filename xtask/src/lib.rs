@@ -4,6 +4,7 @@
 
 pub mod check;
 pub mod components;
+pub mod fuzz;
 pub mod page;
 pub mod product;
 
