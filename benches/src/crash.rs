@@ -18,6 +18,7 @@ use std::{
     collections::BTreeMap,
     fs,
     io::Read as _,
+    os::unix::fs::DirBuilderExt as _,
     path::{Path, PathBuf},
     process::{Command, Stdio},
     time::{Duration, Instant},
@@ -435,6 +436,12 @@ fn rotten(
     let round = ROUNDS;
     copied(&good, &dir)?;
     let first = looked(&dir, round)?;
+    if warns(&first) {
+        return Err(Error::Wish(format!(
+            "a good store is warned of, so no warning tells anything: {}",
+            first.err
+        )));
+    }
     let wanted: Sight = serde_json::from_str(first.out.trim()).map_err(|_| Error::Said {
         who: "the look at a good store".to_owned(),
         said: first.err,
@@ -449,7 +456,7 @@ fn rotten(
         let sight = serde_json::from_str::<Sight>(seen.out.trim())
             .ok()
             .filter(|_| seen.good);
-        let warned = seen.err.contains("WARN") || seen.err.contains("ERROR");
+        let warned = warns(&seen);
         match sight {
             Some(sight) if sight == wanted => unharmed += 1,
             Some(sight) if warned || !sight.half.is_empty() || sight.cut_bytes > 0 => told += 1,
@@ -473,6 +480,11 @@ fn rotten(
     Ok(())
 }
 
+/// Did the stores say to the log that something is wrong?
+fn warns(ended: &Ended) -> bool {
+    ended.err.contains("WARN") || ended.err.contains("ERROR")
+}
+
 fn files(dir: &Path, found: &mut Vec<PathBuf>) -> Result<(), Error> {
     let failed = || Error::io("listing a store");
     for entry in fs::read_dir(dir).map_err(failed())? {
@@ -493,7 +505,11 @@ fn copied(from: &Path, to: &Path) -> Result<(), Error> {
     for file in all {
         let target = to.join(file.strip_prefix(from).unwrap_or(&file));
         let folder = target.parent().unwrap_or(to);
-        fs::create_dir_all(folder)
+        // As the store makes them: folders that others may read are told of.
+        fs::DirBuilder::new()
+            .recursive(true)
+            .mode(0o700)
+            .create(folder)
             .and_then(|()| fs::copy(&file, &target))
             .map_err(Error::io("copying a store"))?;
     }

@@ -247,6 +247,14 @@ fn write(stores: &Stores, kind: &str, n: u64, date_ns: u64) -> Result<u64, Error
 /// # Errors
 /// What keeps it from opening its stores, where the disk was not told to fail.
 pub(crate) fn live(dir: &Path, attic: &Path, life: &Life) -> Result<(), Error> {
+    // What an earlier life kept has no use any more, and has the names that this one gives.
+    match std::fs::remove_dir_all(attic) {
+        Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+            return Err(Error::io("emptying the folder of removed files")(error));
+        }
+        _ => {}
+    }
+    std::fs::create_dir(attic).map_err(Error::io("a folder for removed files"))?;
     let layer = Layer::new(life.mishap, life.at, life.seed, attic);
     if !bumpless_store::interfere(Box::new(layer)) {
         return Err(Error::Wish("somebody interferes already".to_owned()));
@@ -259,9 +267,17 @@ pub(crate) fn live(dir: &Path, attic: &Path, life: &Life) -> Result<(), Error> {
     };
     for round in 0..life.rounds {
         let (n, date_ns) = (life.first + round, life.date_ns + round * PERIOD_NS);
+        let mut has_component = false;
         for kind in KINDS {
+            // As deployment does it: what is not there is not put in force.
+            if kind == "intent" && !has_component {
+                continue;
+            }
             match write(&stores, kind, n, date_ns) {
-                Ok(number) => kept(kind, number)?,
+                Ok(number) => {
+                    has_component |= kind == "component";
+                    kept(kind, number)?;
+                }
                 Err(_) if refuses => {}
                 Err(error) => return Err(error),
             }
