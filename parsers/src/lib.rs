@@ -45,7 +45,7 @@ targets! {
     wire_keys, 512, wire::keys, "keys of the bus between hosts";
     deploy_wire, 4096, wire::messages, "questions, replies and notices between hosts";
     bundle, 16_384, disk::bundle, "bundles of components";
-    component, 8192, guest::component, "components: their bytes, imports, exports and what they say of themselves";
+    component, 24_576, guest::component, "components: their bytes, imports, exports and what they say of themselves";
     state, 2048, guest::state, "states that a law takes over from another";
     modbus_server, 600, modbus::server, "requests to the Modbus server";
     modbus_client, 600, modbus::client, "answers of Modbus devices, by TCP and by serial line";

@@ -200,7 +200,7 @@ fn one(name: &str, fuzzer: &Path, target: &Path, share: Duration) -> Result<Outc
         .arg(format!("-timeout={INPUT_SECONDS_MAX}"))
         .arg(format!("-rss_limit_mb={MEMORY_MIB_MAX}"))
         .arg(format!("-artifact_prefix={}/", folder.display()))
-        .args(["-max_len=16384", "-print_final_stats=1", "-verbosity=1"])
+        .args(["-max_len=24576", "-print_final_stats=1", "-verbosity=1"])
         .args([&corpus, &kept])
         .stdin(Stdio::null())
         .output()

@@ -402,21 +402,15 @@ mod tests {
             loop_id: LoopId::new("level-1").unwrap(),
             last_revision: 7,
         };
+        let id = || LoopId::new("level-1").unwrap();
         let all = [
             ("ask-library", encode(&Ask::Library).unwrap()),
             ("ask-points", encode(&Ask::Points(7)).unwrap()),
-            (
-                "ask-apply",
-                encode(&Ask::Apply(Box::new(draft()), Expect::OneOf(vec![3]))).unwrap(),
-            ),
-            (
-                "notice-intent",
-                encode(&Notice::Intent(LoopId::new("level-1").unwrap(), (3, 4))).unwrap(),
-            ),
+            ("ask-records", encode(&Ask::Records(vec![id()])).unwrap()),
+            ("notice-intent", encode(&Notice::Intent(id(), (3, 4))).unwrap()),
             ("notice-gone", encode(&Notice::Gone(gone)).unwrap()),
             ("reply-done", encode_reply(Ok(Told::Done)).unwrap()),
             ("reply-found", encode_reply(Ok(Told::Found(vec![true, false]))).unwrap()),
-            ("reply-refused", encode_reply(Err(Error::refused("a", "b"))).unwrap()),
         ];
         for (name, bytes) in all {
             let path = folder.join(format!("v{VERSION}-{name}"));

@@ -271,23 +271,3 @@ fn settings_that_make_no_sense_are_refused() {
         "engine setting prepared_max = 0: use 1 or more"
     );
 }
-
-/// Small components for the fuzzers: one that is good, and one whose descriptor is longer. Written anew with `UPDATE_EXPECT=1`.
-#[test]
-fn the_fuzzers_inputs_are_components() {
-    let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../fuzz/corpus/component");
-    let engine = engine();
-    for (name, guest) in [("sum", Guest::good()), ("steps-not", Guest::step("(unreachable)"))] {
-        let path = folder.join(name);
-        if std::env::var_os("UPDATE_EXPECT").is_some() {
-            std::fs::create_dir_all(&folder).expect("a folder");
-            std::fs::write(&path, guest.build()).expect("a file");
-        }
-        let bytes = std::fs::read(&path).expect("a kept component");
-        assert_eq!(
-            engine.inspect(&bytes).expect("a component").descriptor.name,
-            "sum",
-            "{name}"
-        );
-    }
-}
