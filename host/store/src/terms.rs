@@ -89,8 +89,10 @@ fn slots(file: &File) -> io::Result<(u64, u64)> {
             Err(error) if error.kind() == io::ErrorKind::UnexpectedEof => continue,
             Err(error) => return Err(error),
         }
-        if let Some(found) = term(bytes).filter(|found| *found > best.0) {
-            best = (found, number);
+        match term(bytes) {
+            Some(found) if found > best.0 => best = (found, number),
+            Some(_) => {}
+            None => tracing::warn!(slot = number, "terms that were set aside cannot be read; those before them count"),
         }
     }
     Ok(best)
