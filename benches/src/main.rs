@@ -10,6 +10,7 @@ mod call;
 mod chaos;
 mod chaos_report;
 mod conditions;
+mod crash;
 mod devices;
 mod error;
 mod failover;
@@ -103,6 +104,14 @@ enum Bench {
     Languages,
     /// 1,000 points on ten Modbus devices at 10 Hz: requests, staleness, processor time; and one device that is slow.
     Io,
+    /// Stores whose writers end at any change, whose disks fill up, freeze, lose power and rot: what was acknowledged is there.
+    Crash(crash::Wishes),
+    /// The process of `crash` that writes.
+    #[command(hide = true)]
+    CrashLife(crash::LifeArgs),
+    /// The process of `crash` that looks.
+    #[command(hide = true)]
+    CrashLook(crash::LookArgs),
     /// The other process of `io`.
     #[command(hide = true)]
     IoDevices {
@@ -183,6 +192,9 @@ fn run(bench: &Bench, options: Options) -> Result<bool, Error> {
         Bench::Upload => "upload",
         Bench::Page(_) => "page",
         Bench::Io => "io",
+        Bench::Crash(_) => "crash",
+        Bench::CrashLife(args) => return crash::live(args).map(|()| true),
+        Bench::CrashLook(args) => return crash::look(args).map(|()| true),
         Bench::IoDevices { count } => return devices::run(*count).map(|()| true),
         Bench::Burn { core } => return stress::burn(*core).map(|()| true),
         Bench::CallPeer { component } => return peer::run(component).map(|()| true),
@@ -208,6 +220,8 @@ fn run(bench: &Bench, options: Options) -> Result<bool, Error> {
         Bench::Upload => upload::run(options, &mut report)?,
         Bench::Page(watching) => page::run(options, *watching, &mut report)?,
         Bench::Io => io::run(options, &mut report)?,
+        Bench::Crash(wishes) => crash::run(options, *wishes, &mut report)?,
+        Bench::CrashLife(_) | Bench::CrashLook(_) => {}
         Bench::CallPeer { .. } | Bench::Burn { .. } | Bench::IoDevices { .. } => {}
     }
     Ok(report.end())

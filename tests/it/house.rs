@@ -16,7 +16,7 @@ use serde_json::Value;
 const LINES_MAX: usize = 600;
 
 /// What each room may use of the others. Nothing imports upwards; `io engine store cell` never import each other.
-const ROOMS: [(&str, &[&str]); 40] = [
+const ROOMS: [(&str, &[&str]); 41] = [
     ("bumpless-core", &[]),
     ("bumpless-io", &["bumpless-core"]),
     ("bumpless-engine", &["bumpless-core"]),
@@ -88,6 +88,35 @@ const ROOMS: [(&str, &[&str]); 40] = [
     ("bumpless-simulation", &["bumpless-core"]),
     ("rust-pid", &["bumpless-sdk"]),
     ("rust-wasip2-pid", &["bumpless-sdk"]),
+    (
+        "bumpless-parsers",
+        &[
+            "bumpless-core",
+            "bumpless-io",
+            "bumpless-engine",
+            "bumpless-cell",
+            "bumpless-store",
+            "bumpless-deploy",
+            "bumpless-lab",
+            "bumpless-app",
+            "bumpless-sdk",
+            "bumpless-pid",
+            "bumpless-pidplus",
+            "bumpless-on-off",
+            "bumpless-cascade",
+            "bumpless-autotune",
+            "bumpless-feedforward",
+            "bumpless-fuzzy",
+            "bumpless-gain-schedule",
+            "bumpless-kalman-pid",
+            "bumpless-lead-lag",
+            "bumpless-mpc",
+            "bumpless-override-selector",
+            "bumpless-ratio",
+            "bumpless-smith",
+            "bumpless-split-range",
+        ],
+    ),
     ("xtask", &["bumpless-core"]),
 ];
 

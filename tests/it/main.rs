@@ -34,6 +34,7 @@
 //! | languages | the example law in every language: the same numbers, swaps without a bump |
 //! | lab | virtual time against a live cell, and the ways between the two; plants as components |
 //! | guides | the commands in the documentation |
+//! | operations | dry runs, systemd, safe outputs at a stop, backup and restore |
 //! | house | the rules of the source itself |
 
 #![allow(
@@ -64,6 +65,7 @@ mod masters;
 mod members;
 mod modbus;
 mod neighbours;
+mod operations;
 mod past;
 mod phases;
 mod programs;

@@ -47,6 +47,17 @@ pub enum Error {
         /// The end of what it wrote.
         said: String,
     },
+    /// A file or folder that is needed.
+    #[error("{path}: cannot be read")]
+    Read {
+        /// Which.
+        path: PathBuf,
+        /// What the system says.
+        source: io::Error,
+    },
+    /// A fuzzer.
+    #[error("{0}")]
+    Fuzz(String),
     /// A step of the checks failed.
     #[error("the step {step:?} failed")]
     Step {

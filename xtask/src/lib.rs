@@ -6,6 +6,7 @@ pub mod bindings;
 pub mod book;
 pub mod check;
 pub mod components;
+pub mod fuzz;
 pub mod languages;
 pub mod page;
 pub mod product;

@@ -3,7 +3,7 @@
 use std::{path::PathBuf, process::ExitCode};
 
 use clap::Parser;
-use xtask::{Error, bindings, book, check, components, languages, page, product, reference};
+use xtask::{Error, bindings, book, check, components, fuzz, languages, page, product, reference};
 
 /// Sets up, builds and checks Bumpless.
 #[derive(Parser)]
@@ -64,6 +64,9 @@ enum Command {
         #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
         arguments: Vec<String>,
     },
+    /// Feeds every reader of bytes from outside with inputs that a fuzzer makes up:
+    /// `cargo xtask fuzz [--minutes N] [--target NAME] [--keep] [--json]`.
+    Fuzz(fuzz::Wishes),
     /// Builds the operator's page, which the next build of the program embeds. Needs Node.
     Page,
     /// Writes docs/openapi.json from the code.
@@ -82,6 +85,9 @@ enum BindingsOf {
 }
 
 fn main() -> ExitCode {
+    if let Some(code) = fuzz::between() {
+        return code;
+    }
     let done = match Command::parse() {
         Command::Components => components::run().map_err(Error::from),
         Command::Languages { names } => languages::run(&names),
@@ -95,6 +101,7 @@ fn main() -> ExitCode {
         Command::Bench { arguments } => product::bench(&arguments),
         Command::Model { arguments } => product::tool("bumpless-model", &arguments),
         Command::Simulate { arguments } => product::tool("bumpless-simulation", &arguments),
+        Command::Fuzz(wishes) => fuzz::fuzz(&wishes),
         Command::Page => page::build(),
         Command::Openapi => product::openapi(),
         Command::Wit => reference::write(),

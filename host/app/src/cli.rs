@@ -127,6 +127,14 @@ pub(crate) enum Command {
         #[command(subcommand)]
         what: Option<HostsCommand>,
     },
+    /// Write what people made in the cell (components, loops, alarms) into one file.
+    Backup {
+        /// Where it goes.
+        #[arg(short, long, value_name = "FILE")]
+        output: PathBuf,
+    },
+    /// Bring a backup into a cell that has no loops. A backup that is not whole changes nothing.
+    Restore(RestoreArgs),
     /// List the points with their values.
     Points,
     /// Follow a loop: trend, who stepped, control indices.
@@ -158,6 +166,9 @@ pub(crate) struct HostArgs {
     /// Check the configuration and stop.
     #[arg(long)]
     pub(crate) check: bool,
+    /// Check everything that a start needs and that touches neither a device nor the cell, and stop.
+    #[arg(long)]
+    pub(crate) dry_run: bool,
     /// How log lines look on the error output. BUMPLESS_LOG filters them, for example `info,bumpless_loops=debug`.
     #[arg(long, value_enum, default_value_t = LogFormat::Text)]
     pub(crate) log_format: LogFormat,
@@ -167,6 +178,19 @@ pub(crate) struct HostArgs {
     /// Pass faults that are asked for over the API on to the parent, as lines on the standard output: for the demonstration.
     #[arg(long, hide = true)]
     pub(crate) faults_on_stdout: bool,
+}
+
+/// What is restored, and how.
+#[derive(Debug, clap::Args)]
+pub(crate) struct RestoreArgs {
+    /// The backup.
+    pub(crate) file: PathBuf,
+    /// Only look whether it is whole; asks no cell.
+    #[arg(long)]
+    pub(crate) check: bool,
+    /// Start every loop in manual: its outputs stay where they are until somebody says otherwise.
+    #[arg(long)]
+    pub(crate) manual: bool,
 }
 
 /// How log lines look.
@@ -391,6 +415,8 @@ pub fn run(cli: Cli) -> Result<(), Error> {
         Command::Io { what } => commands::io::run(client, json, what),
         Command::Call(args) => commands::components::call(&client()?, json, args),
         Command::Hosts { what } => commands::hosts::run(&client()?, json, what.unwrap_or(HostsCommand::List)),
+        Command::Backup { output } => commands::backup::backup(&client()?, json, &output),
+        Command::Restore(args) => commands::backup::restore(client, json, &args),
         Command::Points => commands::hosts::points(&client()?, json),
         Command::Watch(args) => watch::run(&client()?, json, &args),
         Command::Completions { shell } => {
@@ -425,6 +451,7 @@ mod tests {
             "bumpless build level.st -o level.wasm",
             "bumpless check level",
             "bumpless dev level --loop pressure",
+            "bumpless host --config host.toml --dry-run",
             "bumpless upload pid.wasm --note x --json",
             "bumpless upload pid.wasm --label stage=pilot --label line=3 --force --wait",
             "bumpless upload pid.wasm --dry-run",
@@ -504,6 +531,9 @@ mod tests {
             "bumpless io job start line set-range --wait --key k",
             "bumpless io job start line write-block --table holding --address 7 --values 1,2,3",
             "bumpless io job show plant.1000001",
+            "bumpless backup -o cell.tar --json",
+            "bumpless restore cell.tar --check",
+            "bumpless restore cell.tar --manual",
             "bumpless io job list",
             "bumpless io job cancel plant.1000001",
             "bumpless watch pressure --plain --cycles 5",

@@ -5,6 +5,7 @@
 pub(crate) mod alarms;
 pub(crate) mod audit;
 pub(crate) mod author;
+pub(crate) mod backup;
 pub(crate) mod components;
 pub(crate) mod curves;
 pub(crate) mod history;
@@ -19,3 +20,11 @@ pub(crate) mod point_lists;
 pub(crate) mod programs;
 pub(crate) mod rollouts;
 pub(crate) mod step;
+
+/// Reads a loop file's text. `path` is for messages.
+///
+/// # Errors
+/// [`crate::Error::Config`] with the place in the text.
+pub fn loop_file(text: &str, path: &std::path::Path) -> Result<bumpless_api::types::LoopDraft, crate::Error> {
+    loops::parse(text, path)
+}

@@ -16,7 +16,7 @@ use bumpless_api::types::Fault;
 use bumpless_cell::{Arrival, Roles, Session};
 use bumpless_deploy::{Deploy, DeployArrival, Parts};
 use bumpless_engine::Engine;
-use bumpless_io::{Clock, IoServer};
+use bumpless_io::{Clock, IoServer, Rest};
 use bumpless_lab::Library;
 use bumpless_loops::{Loops, LoopsEvent};
 use bumpless_scada::Servers;
@@ -274,8 +274,14 @@ impl Running {
         }
     }
 
-    /// Leaves the cell in order: hands its loops to others, then stops every room.
-    pub async fn stop(self) {
+    /// Tells for how long the host's cycles stand still, in ns: the age of the oldest turn of its workers.
+    pub fn heart(&self) -> impl Fn() -> u64 + Send + Sync + use<> {
+        let loops = self.loops.clone();
+        move || loops.longest_turn_ns()
+    }
+
+    /// Leaves the cell in order: hands its loops to others, then stops every room. Gives how each bus left its outputs.
+    pub async fn stop(self) -> Vec<Rest> {
         self.modbus_servers.stop().await;
         self.deploy.shutdown().await;
         self.stop_api.send_replace(true);
@@ -290,14 +296,14 @@ impl Running {
         let (loops, io) = (self.loops, self.io);
         let stopped = blocking(move || {
             loops.stop();
-            if let Some(io) = io {
-                io.close();
-            }
+            io.map(|io| io.close()).unwrap_or_default()
         });
-        if let Err(error) = stopped.await {
+        let rests = stopped.await.unwrap_or_else(|error| {
             tracing::warn!(%error, "a room ended with a panic");
-        }
+            Vec::new()
+        });
         self.session.close().await;
+        rests
     }
 }
 

@@ -9,6 +9,7 @@
 use std::{io::Read as _, sync::Arc, time::Duration};
 
 use bumpless_api::types::Fault;
+use bumpless_io::{OnStop, Rest};
 use bumpless_telemetry::{Identity, Telemetry};
 use serde::{Deserialize, Serialize};
 use tokio::{
@@ -16,7 +17,7 @@ use tokio::{
     sync::mpsc,
 };
 
-use crate::{cli::HostArgs, compose, config::Config, error::Error, log, realtime, show};
+use crate::{cli::HostArgs, compose, config::Config, dry_run, error::Error, log, realtime, show, systemd::Systemd};
 
 /// Tasks of the runtime get this long to end once everything is stopped.
 const RUNTIME_STOP_TIME_MAX: Duration = Duration::from_secs(2);
@@ -40,7 +41,11 @@ pub(crate) struct Ready {
 /// Runs a host until it is told to stop.
 pub(crate) fn run(args: &HostArgs) -> Result<(), Error> {
     let config = Config::read(&args.config, args.data.as_deref())?;
-    if args.check {
+    if args.dry_run {
+        log::start(args.log_format, None);
+        dry_run::run(&config)?;
+    }
+    if args.check || args.dry_run {
         let roles = match (config.io, config.control) {
             (true, true) => "io and control",
             (true, false) => "io",
@@ -98,13 +103,17 @@ async fn live(config: Config, mut telemetry: Option<Telemetry>, args: &HostArgs)
     };
     show::line(&serde_json::to_string(&ready).map_err(|error| Error::start("the line that says ready", error))?)?;
 
+    let systemd = Systemd::ready(running.heart(), &ready.api);
     let end = tokio::select! {
         _ = terminate.recv() => { tracing::info!("SIGTERM: draining"); Ok(()) }
         _ = interrupt.recv() => { tracing::info!("SIGINT: draining"); Ok(()) }
         () = parent_gone => { tracing::info!("the parent is gone: draining"); Ok(()) }
         error = running.failed() => Err(error),
     };
-    running.stop().await;
+    systemd.stopping();
+    for rest in running.stop().await {
+        told(&rest);
+    }
     if let Some(telemetry) = telemetry {
         // It waits for the collector, for some seconds at most.
         let ended = tokio::task::spawn_blocking(move || telemetry.stop()).await;
@@ -114,6 +123,25 @@ async fn live(config: Config, mut telemetry: Option<Telemetry>, args: &HostArgs)
     }
     tracing::info!("stopped");
     end
+}
+
+/// Says how a bus left its outputs.
+fn told(rest: &Rest) {
+    match (&rest.wanted, &rest.reason) {
+        (OnStop::Hold, _) => tracing::info!(bus = %rest.bus, "the outputs stay where they are (on_stop = \"hold\")"),
+        (OnStop::Safe, None) => tracing::info!(
+            bus = %rest.bus,
+            outputs = rest.outputs,
+            "every output is at its safe value, and the device confirmed it"
+        ),
+        (OnStop::Safe, Some(reason)) => tracing::error!(
+            bus = %rest.bus,
+            outputs = rest.outputs,
+            confirmed = rest.confirmed,
+            reason,
+            "outputs are NOT confirmed at their safe values: look at the plant"
+        ),
+    }
 }
 
 /// Passes faults on to the parent, one JSON line each. Ends with the API.

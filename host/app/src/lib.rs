@@ -15,13 +15,16 @@ mod cli;
 mod client;
 mod commands;
 mod demo;
+mod dry_run;
 mod error;
 mod host;
 mod log;
 mod show;
 mod stop;
+mod systemd;
 mod watch;
 
 pub use cli::{Cli, run};
+pub use commands::loop_file;
 pub use config::Config;
 pub use error::Error;

@@ -67,6 +67,7 @@ mod wire;
 pub mod commissioning;
 pub mod draft;
 pub mod limits;
+pub mod parsers;
 pub mod programs;
 pub mod report;
 pub mod rollout;

@@ -350,9 +350,8 @@ mod tests {
 
     use super::*;
 
-    #[test]
-    fn everything_comes_back_as_it_went() {
-        let draft = LoopDraft {
+    fn draft() -> LoopDraft {
+        LoopDraft {
             name: "l".into(),
             component: "pid".into(),
             period_ms: 10.0,
@@ -378,9 +377,13 @@ mod tests {
             fallback_parameters: BTreeMap::from([("k".into(), 0.5)]),
             prefer: vec!["a".into()],
             policy: Policy::default(),
-        };
+        }
+    }
+
+    #[test]
+    fn everything_comes_back_as_it_went() {
         for ask in [
-            Ask::Apply(Box::new(draft), Expect::OneOf(vec![3])),
+            Ask::Apply(Box::new(draft()), Expect::OneOf(vec![3])),
             Ask::Library,
             Ask::Points(7),
         ] {
@@ -395,6 +398,35 @@ mod tests {
             refusal,
         ] {
             assert_eq!(decode_reply(encode_reply(reply.clone()).unwrap()), reply);
+        }
+    }
+
+    /// As in `bumpless_cell::wire`: what this version sends is kept, byte by byte. Where this fails, give `VERSION` the next number,
+    /// and write the new ones with `UPDATE_EXPECT=1`.
+    #[test]
+    fn what_is_sent_is_what_this_version_always_sent() {
+        let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../fuzz/corpus/deploy_wire");
+        let gone = Tombstone {
+            loop_id: LoopId::new("level-1").unwrap(),
+            last_revision: 7,
+        };
+        let id = || LoopId::new("level-1").unwrap();
+        let all = [
+            ("ask-library", encode(&Ask::Library).unwrap()),
+            ("ask-points", encode(&Ask::Points(7)).unwrap()),
+            ("ask-records", encode(&Ask::Records(vec![id()])).unwrap()),
+            ("notice-intent", encode(&Notice::Intent(id(), (3, 4))).unwrap()),
+            ("notice-gone", encode(&Notice::Gone(gone)).unwrap()),
+            ("reply-done", encode_reply(Ok(Told::Done)).unwrap()),
+            ("reply-found", encode_reply(Ok(Told::Found(vec![true, false]))).unwrap()),
+        ];
+        for (name, bytes) in all {
+            let path = folder.join(format!("v{VERSION}-{name}"));
+            if std::env::var_os("UPDATE_EXPECT").is_some() {
+                std::fs::create_dir_all(&folder).unwrap();
+                std::fs::write(&path, &bytes).unwrap();
+            }
+            assert_eq!(std::fs::read(&path).ok(), Some(bytes), "{}", path.display());
         }
     }
 

@@ -19,6 +19,7 @@ use crate::{
     force::Forces,
     limits::{BUSES_MAX, POINTS_MAX},
     modbus::{Plan, Transport, driver::ModbusDriver},
+    rest::Rest,
     sim::{ModelMaker, NoModels, driver::SimDriver},
 };
 
@@ -188,6 +189,33 @@ impl IoServer {
             })
             .collect();
         Ok(server)
+    }
+
+    /// Plans every bus with devices as [`IoServer::open`] does, reads the certificates that it names, and starts none. Gives how many
+    /// points they have. Simulated plants are not made.
+    ///
+    /// # Errors
+    /// As [`IoServer::open`].
+    pub fn planned(config: &Config) -> Result<usize, Error> {
+        let mut names = std::collections::HashSet::new();
+        let mut points = 0;
+        for bus in &config.buses {
+            let (_, infos) = match bus {
+                BusConfig::Sim(_) => continue,
+                BusConfig::ModbusTcp(modbus) => modbus.plan(Transport::Tcp)?,
+                BusConfig::ModbusRtu(modbus) => modbus.plan(Transport::Line)?,
+            };
+            points += infos.len();
+            for info in infos {
+                if let Some(twice) = names.replace(info.id) {
+                    return Err(Error::config(
+                        format!("bus {:?}, point {twice:?}", info.bus),
+                        "another point has this name; give each its own".to_owned(),
+                    ));
+                }
+            }
+        }
+        Ok(points)
     }
 
     fn add_points(&mut self, bus: usize, infos: Vec<PointInfo>) -> Result<(), Error> {
@@ -386,29 +414,32 @@ impl IoServer {
 
     /// Refuses further writes, brings each bus's outputs to what its `on_stop` says, ends tasks and journals. Waits for
     /// them, at most `CLOSE_WAIT_MS` and a request's time-out; so not to be called on the only thread of `runtime`. A
-    /// second call does nothing.
-    pub fn close(&self) {
+    /// second call does nothing. Gives how each bus left its outputs.
+    pub fn close(&self) -> Vec<Rest> {
         if !std::mem::replace(&mut *self.open.write(), false) {
-            return;
+            return Vec::new();
         }
+        let mut rests = Vec::with_capacity(self.buses.len());
         // All are told first, so that they end side by side.
         for bus in &self.buses {
             match bus {
-                Bus::Sim(sim) => sim.close(self.clock.now_ns()),
+                Bus::Sim(sim) => rests.push(sim.close(self.clock.now_ns())),
                 Bus::Modbus(modbus) => modbus.stop(),
             }
         }
         for bus in &self.buses {
             if let Bus::Modbus(modbus) = bus {
-                modbus.wait_for_end();
+                rests.push(modbus.wait_for_end());
             }
         }
+        rests
     }
 }
 
 impl Drop for IoServer {
     fn drop(&mut self) {
-        self.close();
+        // Whoever wants to know how the outputs were left closes it himself.
+        let _rests = self.close();
     }
 }
 

@@ -93,6 +93,9 @@ impl Loops {
             owned: AtomicI64::new(0),
             held: AtomicI64::new(0),
             dropped: AtomicU64::new(0),
+            turns: (0..config.workers.clamp(1, 64))
+                .map(|_| AtomicU64::new(clock.now_ns()))
+                .collect(),
             flip_bits: config.flip_bits_every.map(FlipBits::new),
             inboxes: OnceLock::new(),
         });
@@ -358,6 +361,16 @@ impl Loops {
     #[must_use]
     pub fn dropped(&self) -> u64 {
         self.inner.shared.dropped.load(Ordering::Relaxed)
+    }
+
+    /// For how long the worker that came round longest ago has not, in ns. One that has nothing to do comes round each second; one
+    /// that hangs does not, and its loops run no cycles.
+    #[must_use]
+    pub fn longest_turn_ns(&self) -> u64 {
+        let shared = &self.inner.shared;
+        let now_ns = shared.now_ns();
+        let since = |turn: &AtomicU64| now_ns.saturating_sub(turn.load(Ordering::Relaxed));
+        shared.turns.iter().map(since).max().unwrap_or(0)
     }
 
     /// Stops the workers and waits for them, at most two seconds. Blocks.

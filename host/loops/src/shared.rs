@@ -33,6 +33,8 @@ pub(crate) struct Shared {
     pub(crate) owned: AtomicI64,
     pub(crate) held: AtomicI64,
     pub(crate) dropped: AtomicU64,
+    /// When each worker last began a turn, by the host's clock: a worker that does not come round runs no cycle.
+    pub(crate) turns: Vec<AtomicU64>,
     /// A test device; none in service.
     pub(crate) flip_bits: Option<FlipBits>,
     /// The workers' inboxes, for messages from a loop on one worker to a home on another.

@@ -6,7 +6,7 @@
 use std::{
     cmp::Reverse,
     collections::{BinaryHeap, HashMap},
-    sync::Arc,
+    sync::{Arc, atomic::Ordering},
     time::Duration,
 };
 
@@ -87,6 +87,9 @@ impl Worker {
                 }
             }
             let now_ns = self.fire();
+            if let Some(turn) = self.shared.turns.get(self.index) {
+                turn.store(now_ns, Ordering::Relaxed);
+            }
             let next_ns = self
                 .timers
                 .peek()

@@ -23,4 +23,4 @@ mod server;
 
 pub use config::ModbusServerConfig;
 pub use error::Error;
-pub use server::{Servers, start};
+pub use server::{Servers, check, start};

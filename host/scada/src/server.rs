@@ -30,6 +30,20 @@ pub struct Servers {
     counts: Vec<Arc<ServerCounts>>,
 }
 
+/// Reads the maps and certificates of servers as [`start`] does, and starts none.
+///
+/// # Errors
+/// The first map or certificate that is wrong, by its server.
+pub fn check(configs: &[ModbusServerConfig]) -> Result<(), Error> {
+    for config in configs {
+        Map::new(config)?;
+        if let Some(tls) = &config.tls {
+            tls.open(&format!("modbus_server on {}", config.listen))?;
+        }
+    }
+    Ok(())
+}
+
 /// Starts all servers, on the async runtime of the caller.
 ///
 /// # Errors

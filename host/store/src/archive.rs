@@ -39,6 +39,13 @@ mod disk;
 mod file;
 mod memory;
 mod writer;
+pub(crate) mod parsing {
+    //! The forms of blocks and files, for [`crate::parsers`].
+    pub(crate) use super::{
+        block::{Head, rows},
+        file::frames,
+    };
+}
 
 pub use block::{RowBlock, pack as pack_rows, unpack as unpack_rows};
 

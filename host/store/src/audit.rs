@@ -15,7 +15,7 @@
 
 use std::{
     fs::{self, File, OpenOptions},
-    io::{self, Read as _, Seek as _, SeekFrom, Write as _},
+    io::{self, Read as _, Seek as _, SeekFrom},
     ops::RangeInclusive,
     os::unix::fs::OpenOptionsExt as _,
     path::{Path, PathBuf},
@@ -32,6 +32,7 @@ use bumpless_core::{
 
 use crate::{
     error::Error,
+    medium,
     store::{Store, private_dir, sync_parent},
 };
 
@@ -249,12 +250,9 @@ impl AuditLog {
         let first = tail.number + 1;
         if tail.open.is_none() {
             let path = named(&self.dir, first);
-            let file = OpenOptions::new()
-                .append(true)
-                .create(true)
-                .mode(0o600)
-                .open(&path)
-                .map_err(|error| Error::io("create", &path, error))?;
+            let mut options = OpenOptions::new();
+            options.append(true).create(true).mode(0o600);
+            let file = medium::open(&path, &options).map_err(|error| Error::io("create", &path, error))?;
             sync_parent(&path)?;
             let bytes = file.metadata().map_err(|error| Error::io("read", &path, error))?.len();
             if tail.segments.last().is_none_or(|(last, _)| *last != first) {
@@ -266,16 +264,12 @@ impl AuditLog {
         let Some(open) = tail.open.as_mut() else {
             return Ok(Vec::new());
         };
-        let written = open
-            .file
-            .write_all(text.as_bytes())
-            .and_then(|()| open.file.sync_data());
+        let written = medium::append(&open.file, &path, text.as_bytes(), open.bytes)
+            .and_then(|()| medium::sync_data(&open.file, &path));
         if let Err(error) = written {
             // Half a line would be cut at the next start; here it would stand between two entries.
-            if open
-                .file
-                .set_len(open.bytes)
-                .and_then(|()| open.file.sync_data())
+            if medium::set_len(&open.file, &path, open.bytes)
+                .and_then(|()| medium::sync_data(&open.file, &path))
                 .is_err()
             {
                 tail.open = None;
@@ -332,7 +326,7 @@ impl AuditLog {
     /// As [`AuditLog::append`]; nothing is removed then.
     pub fn trim(&self, overdue: &Overdue, said: String) -> Result<(), Error> {
         self.append(&[said])?;
-        fs::remove_file(&overdue.path).map_err(|error| Error::io("remove", &overdue.path, error))?;
+        medium::remove(&overdue.path).map_err(|error| Error::io("remove", &overdue.path, error))?;
         self.tail().segments.retain(|(first, _)| *first != overdue.first);
         tracing::info!(bytes = overdue.bytes, "the oldest part of the audit trail is removed");
         sync_parent(&overdue.path)
@@ -397,18 +391,14 @@ impl AuditLog {
     pub fn begin(&self, said: &str) -> Option<AuditBegun> {
         let number = self.begun.fetch_add(1, Ordering::Relaxed);
         let path = self.dir.join("begun").join(number.to_string());
-        let written = OpenOptions::new()
-            .write(true)
-            .create(true)
-            .truncate(true)
-            .mode(0o600)
-            .open(&path)
-            .and_then(|mut file| file.write_all(said.as_bytes()));
+        let mut options = OpenOptions::new();
+        options.write(true).create(true).truncate(true).mode(0o600);
+        let written = medium::open(&path, &options).and_then(|file| medium::write_at(&file, &path, said.as_bytes(), 0));
         match written {
             Ok(()) => Some(AuditBegun { path }),
             Err(error) => {
                 tracing::debug!(%error, "what is begun is not noted");
-                drop(fs::remove_file(&path));
+                drop(medium::remove(&path));
                 None
             }
         }
@@ -429,7 +419,7 @@ pub struct AuditBegun {
 
 impl Drop for AuditBegun {
     fn drop(&mut self) {
-        if let Err(error) = fs::remove_file(&self.path) {
+        if let Err(error) = medium::remove(&self.path) {
             tracing::debug!(%error, "a note of something begun stays until the next start");
         }
     }
@@ -447,7 +437,7 @@ fn begun(dir: &Path) -> Result<Vec<String>, Error> {
         if read.is_ok() && !text.is_empty() && notes.len() < BEGUN_MAX {
             notes.push(text);
         }
-        fs::remove_file(&path).map_err(|error| Error::io("remove", &path, error))?;
+        medium::remove(&path).map_err(|error| Error::io("remove", &path, error))?;
     }
     notes.sort();
     Ok(notes)
@@ -476,8 +466,8 @@ fn cut(path: &Path) -> Result<(u64, String), Error> {
             .write(true)
             .open(path)
             .map_err(|error| Error::io("open", path, error))?;
-        file.set_len(kept)
-            .and_then(|()| file.sync_all())
+        medium::set_len(&file, path, kept)
+            .and_then(|()| medium::sync(&file, path))
             .map_err(|error| Error::io("cut", path, error))?;
         text = text_of(path)?;
     }

@@ -111,7 +111,7 @@ impl Store {
     pub fn remove_component(&self, digest: &Digest) -> Result<bool, Error> {
         let path = self.component_path(digest);
         let _files = self.inner.files.lock().unwrap_or_else(PoisonError::into_inner);
-        match fs::remove_file(&path) {
+        match crate::medium::remove(&path) {
             Ok(()) => sync_parent(&path).map(|()| true),
             Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(false),
             Err(error) => Err(Error::io("remove", &path, error)),

@@ -33,6 +33,12 @@ use crate::{database::Opener, error::Error, store::Store};
 
 mod chunk;
 mod cursor;
+pub(crate) mod parsing {
+    //! The form of a chunk, for [`crate::parsers`].
+    #[cfg(test)]
+    pub(crate) use super::chunk::encode;
+    pub(crate) use super::chunk::{decode, sealed};
+}
 mod shelf;
 
 pub use cursor::{Cursor, Window};
@@ -161,7 +167,7 @@ impl CycleLog {
             Err(error @ (Error::Damaged { .. } | Error::NotAStore { .. })) => {
                 let aside = path.with_extension("damaged");
                 tracing::error!(%error, aside = %aside.display(), "the log of cycles is moved aside, and begins anew");
-                std::fs::rename(&path, &aside).map_err(|error| Error::io("move away", &path, error))?;
+                crate::medium::rename(&path, &aside).map_err(|error| Error::io("move away", &path, error))?;
                 Shelf::open(&path, bounds, opener())?
             }
             other => other?,

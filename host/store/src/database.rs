@@ -25,7 +25,7 @@ use redb::{
     WriteTransaction,
 };
 
-use crate::error::Error;
+use crate::{error::Error, medium};
 
 /// Facts about the file itself, by name.
 const FACTS: TableDefinition<&str, u64> = TableDefinition::new("facts");
@@ -195,7 +195,7 @@ impl std::fmt::Debug for Base {
 /// Makes the file under another name first: a process that dies in the middle leaves no half database behind.
 fn create(path: &Path, format: u64, usage: Use, opener: &Opener) -> Result<(), Error> {
     let draft = path.with_extension("new");
-    match std::fs::remove_file(&draft) {
+    match medium::remove(&draft) {
         Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
             return Err(Error::io("remove", &draft, error));
         }
@@ -216,19 +216,19 @@ fn create(path: &Path, format: u64, usage: Use, opener: &Opener) -> Result<(), E
 }
 
 fn open_file(path: &Path, usage: Use, opener: &Opener) -> Result<Database, Error> {
-    let file = OpenOptions::new()
-        .read(true)
-        .write(true)
-        .create(true)
-        .truncate(false)
-        .mode(0o600)
-        .open(path)
-        .map_err(|error| Error::io("open", path, error))?;
+    let mut options = OpenOptions::new();
+    options.read(true).write(true).create(true).truncate(false).mode(0o600);
+    let file = medium::open(path, &options).map_err(|error| Error::io("open", path, error))?;
     let mut builder = Builder::new();
     builder
         .set_cache_size(usage.cache_bytes)
         .set_check_integrity_on_open(usage.check_all);
-    opener(&builder, file).map_err(|error| match error {
+    let opened = if medium::is_interfered_with() {
+        medium::Watched::new(file, path).and_then(|watched| builder.create_with_backend(watched))
+    } else {
+        opener(&builder, file)
+    };
+    opened.map_err(|error| match error {
         // redb says so of a file that is not its own.
         DatabaseError::Storage(redb::StorageError::Io(error)) if error.kind() == std::io::ErrorKind::InvalidData => {
             let source = Box::new(redb::Error::Corrupted(error.to_string()));

@@ -36,6 +36,8 @@ mod error;
 mod forces;
 mod format;
 mod intents;
+mod medium;
+pub mod parsers;
 mod programs;
 mod records;
 mod rollouts;
@@ -53,6 +55,7 @@ pub use audit::{AUDIT_BYTES_MAX, AuditBegun, AuditFound, AuditHead, AuditLog, Ov
 pub use cycles::{BYTES_MAX as CYCLE_BYTES_MAX, Cursor, CycleCounts, CycleLog, Window};
 pub use error::Error;
 pub use intents::Tombstone;
+pub use medium::{Interference, Touch, interfere};
 pub use store::{FORMAT, Store};
 pub use writer::{OnDisk, RecordWriter, WriterCounts};
 

@@ -20,6 +20,7 @@ use crate::{
     database::{Base, HOST, Opener},
     error::Error,
     format::RowError,
+    medium,
 };
 
 /// Version of the directory's layout and of the tables in it.
@@ -191,7 +192,7 @@ fn remove_drafts(dir: &Path) -> Result<(), Error> {
     for entry in fs::read_dir(dir).map_err(|error| Error::io("read", dir, error))? {
         let path = entry.map_err(|error| Error::io("read", dir, error))?.path();
         if path.extension().is_some_and(|ending| ending == DRAFT) {
-            fs::remove_file(&path).map_err(|error| Error::io("remove", &path, error))?;
+            medium::remove(&path).map_err(|error| Error::io("remove", &path, error))?;
         }
     }
     Ok(())
@@ -201,18 +202,15 @@ fn remove_drafts(dir: &Path) -> Result<(), Error> {
 pub(crate) fn write_durably(path: &Path, bytes: &[u8]) -> Result<(), Error> {
     let draft = path.with_extension(DRAFT);
     let write = || -> io::Result<()> {
-        let mut file = OpenOptions::new()
-            .write(true)
-            .create(true)
-            .truncate(true)
-            .mode(0o600)
-            .open(&draft)?;
-        file.write_all(bytes)?;
-        file.sync_all()
+        let mut options = OpenOptions::new();
+        options.write(true).create(true).truncate(true).mode(0o600);
+        let file = medium::open(&draft, &options)?;
+        medium::write_at(&file, &draft, bytes, 0)?;
+        medium::sync(&file, &draft)
     };
     if let Err(error) = write() {
         // A full disk must not keep the half file; its error is the one that counts.
-        let _ = fs::remove_file(&draft);
+        let _ = medium::remove(&draft);
         return Err(Error::io("write", path, error));
     }
     rename_durably(&draft, path)
@@ -220,7 +218,7 @@ pub(crate) fn write_durably(path: &Path, bytes: &[u8]) -> Result<(), Error> {
 
 /// Renames within one directory, and makes the new name outlive a power cut.
 pub(crate) fn rename_durably(from: &Path, to: &Path) -> Result<(), Error> {
-    fs::rename(from, to).map_err(|error| Error::io("rename a file to", to, error))?;
+    medium::rename(from, to).map_err(|error| Error::io("rename a file to", to, error))?;
     sync_parent(to)
 }
 
@@ -230,7 +228,5 @@ pub(crate) fn sync_parent(path: &Path) -> Result<(), Error> {
         Some(parent) if !parent.as_os_str().is_empty() => parent,
         _ => Path::new("."),
     };
-    File::open(parent)
-        .and_then(|dir| dir.sync_all())
-        .map_err(|error| Error::io("sync", parent, error))
+    medium::sync_folder(parent).map_err(|error| Error::io("sync", parent, error))
 }

@@ -15,7 +15,7 @@ use std::{
     sync::PoisonError,
 };
 
-use crate::{Error, Store};
+use crate::{Error, Store, medium};
 
 const TERMS_FILE: &str = "terms";
 const SLOT_BYTES: u64 = 16;
@@ -53,24 +53,19 @@ impl Store {
         let path = self.terms_path();
         let _files = self.inner.files.lock().unwrap_or_else(PoisonError::into_inner);
         let is_new = !path.exists();
-        let file = OpenOptions::new()
-            .read(true)
-            .write(true)
-            .create(true)
-            .truncate(false)
-            .mode(0o600)
-            .open(&path)
-            .map_err(|error| Error::io("open", &path, error))?;
+        let mut options = OpenOptions::new();
+        options.read(true).write(true).create(true).truncate(false).mode(0o600);
+        let file = medium::open(&path, &options).map_err(|error| Error::io("open", &path, error))?;
         let write = || {
             let (kept, counts) = slots(&file)?;
             if up_to <= kept {
                 return Ok(());
             }
             if is_new {
-                file.write_all_at(&slot(0), SLOT_BYTES)?;
+                medium::write_at(&file, &path, &slot(0), SLOT_BYTES)?;
             }
-            file.write_all_at(&slot(up_to), (1 - counts) * SLOT_BYTES)?;
-            file.sync_all()
+            medium::write_at(&file, &path, &slot(up_to), (1 - counts) * SLOT_BYTES)?;
+            medium::sync(&file, &path)
         };
         write().map_err(|error| Error::io("write", &path, error))?;
         if is_new {
@@ -94,11 +89,22 @@ fn slots(file: &File) -> io::Result<(u64, u64)> {
             Err(error) if error.kind() == io::ErrorKind::UnexpectedEof => continue,
             Err(error) => return Err(error),
         }
-        if let Some(found) = term(bytes).filter(|found| *found > best.0) {
-            best = (found, number);
+        match term(bytes) {
+            Some(found) if found > best.0 => best = (found, number),
+            Some(_) => {}
+            None => tracing::warn!(
+                slot = number,
+                "terms that were set aside cannot be read; those before them count"
+            ),
         }
     }
     Ok(best)
+}
+
+/// The greatest good one of a file's bytes.
+pub(crate) fn greatest(bytes: &[u8]) -> u64 {
+    let (slots, _) = bytes.as_chunks::<{ SLOT_BYTES as usize }>();
+    slots.iter().take(2).filter_map(|slot| term(*slot)).max().unwrap_or(0)
 }
 
 #[cfg(test)]

@@ -72,7 +72,7 @@ pub(crate) fn read(file: &Path) -> Result<LoopDraft, Error> {
     parse(&fs::read_to_string(file).map_err(failed)?, file)
 }
 
-fn parse(text: &str, file: &Path) -> Result<LoopDraft, Error> {
+pub(super) fn parse(text: &str, file: &Path) -> Result<LoopDraft, Error> {
     toml::from_str(text).map_err(|error| Error::Config {
         path: file.to_owned(),
         place: crate::config::place(text, error.span()),

@@ -200,3 +200,24 @@ proptest! {
         round_trip(&Token(token));
     }
 }
+
+/// The folder of inputs that are kept for the fuzzers, and of what earlier versions sent.
+fn kept() -> std::path::PathBuf {
+    std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../fuzz/corpus/wire")
+}
+
+/// Postcard has no field names: a field more, and every later byte means something else. So what this version sends is kept, byte by
+/// byte. Where this fails the shape of a message changed: give `VERSION` the next number, then write the new ones with `UPDATE_EXPECT=1`.
+#[test]
+fn what_is_sent_is_what_this_version_always_sent() {
+    for (n, bytes) in envelopes().into_iter().enumerate() {
+        let path = kept().join(format!("v{VERSION}-{n:02}"));
+        if std::env::var_os("UPDATE_EXPECT").is_some() {
+            std::fs::create_dir_all(kept()).unwrap();
+            std::fs::write(&path, &bytes).unwrap();
+        }
+        let before = std::fs::read(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+        assert_eq!(before, bytes, "{}", path.display());
+        read_as_all(&before);
+    }
+}

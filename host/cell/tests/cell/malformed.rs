@@ -69,6 +69,35 @@ async fn bad_bytes_are_reported_one_by_one_and_good_ones_still_arrive() {
     assert_eq!(a.session.counters().malformed, 9);
 }
 
+/// Messages as a host of a neighbouring version sends them: what this version sends, kept byte by byte, behind the version's own byte.
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
+async fn hosts_of_another_version_are_refused_in_words() {
+    let mut a = Peer::join("versions", "a", &[]).await;
+    let stranger = stranger(&a);
+    let kept = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../fuzz/corpus/wire");
+    let message = |number: u32| std::fs::read(kept.join(format!("v{VERSION}-{number:02}"))).unwrap();
+    // As many as are reported in a second.
+    let lanes = [(0, "host/a/sample/b"), (1, "record/pressure-1"), (3, "vitals/b")];
+    let mut refused = 0;
+    for other in [VERSION - 1, VERSION + 1, u8::MAX] {
+        for (number, lane) in lanes {
+            let mut bytes = message(number);
+            assert_eq!(std::mem::replace(&mut bytes[0], other), VERSION);
+            let key = format!("bumpless/versions/{lane}");
+            stranger.put(&key, bytes).wait().unwrap();
+            let (found, text) = report(&mut a).await;
+            assert_eq!(found, key);
+            let words = format!(
+                "of wire version {other} cannot be read, this host speaks version {VERSION}; update the older host"
+            );
+            assert!(text.contains(&words), "{key}: {text}");
+            refused += 1;
+        }
+    }
+    assert_eq!(a.session.counters().malformed, refused);
+    assert_eq!(a.session.counters().received, 0, "nothing of it was taken");
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn a_token_that_is_none_makes_no_host() {
     let mut a = Peer::join("tokens", "a", &[]).await;

@@ -193,3 +193,16 @@ fn what_does_not_fit_is_not_packed() {
     let error = pack(vec![(info, bytes); 4]).unwrap_err().to_string();
     assert!(error.contains("make several bundles"), "{error}");
 }
+
+/// A bundle for the fuzzers. Written anew with `UPDATE_EXPECT=1`.
+#[test]
+fn a_bundle_of_an_earlier_day_is_read() {
+    let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../fuzz/corpus/bundle/one");
+    if std::env::var_os("UPDATE_EXPECT").is_some() {
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        std::fs::write(&path, pack(vec![component("pid")]).unwrap()).unwrap();
+    }
+    let entries = unpack(&std::fs::read(&path).unwrap()).unwrap();
+    let (_, parcel) = &entries[0];
+    assert_eq!(parcel.as_ref().unwrap().bytes, b"the bytes of pid");
+}

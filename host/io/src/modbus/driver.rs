@@ -3,6 +3,7 @@
 //! Never: waits for the device.
 
 use std::{
+    collections::BTreeMap,
     sync::{
         Arc,
         atomic::{AtomicU32, Ordering},
@@ -22,10 +23,12 @@ use super::{
 };
 use crate::{
     BusStatus, Clock, Errand, Error,
+    config::OnStop,
     errand::{Asked, Post},
     image::Image,
     limits::CLOSE_WAIT_MS,
     master::{Keeper, Mastership, RedundantPlan},
+    rest::Rest,
     status::StatusCell,
 };
 
@@ -39,6 +42,9 @@ pub(crate) struct Shared {
     pub(crate) clock: Clock,
     /// Of a device with two masters: may this one write? None where there is only one.
     pub(crate) mastership: Option<Arc<Mastership>>,
+    /// What came of the last writes, by connection: how many safe values it has, and why they are not confirmed. A connection that
+    /// was not there at the end has no entry.
+    pub(crate) rests: Mutex<BTreeMap<usize, Option<String>>>,
     /// One bit for each connection over which a unit answers.
     answering: AtomicU32,
 }
@@ -94,6 +100,7 @@ impl ModbusDriver {
             outbox: Outbox::new(lanes, ms_to_ns(plan.write_repeat_ms), ms_to_ns(plan.write_expiry_ms)),
             status: StatusCell::new(plan.bus.clone(), plan.way.driver(), false, plan.points.len()),
             clock,
+            rests: Mutex::default(),
             answering: AtomicU32::new(0),
             mastership: plan.redundant.as_ref().map(|_| Arc::default()),
             plan,
@@ -203,12 +210,33 @@ impl ModbusDriver {
         self.stop.send_replace(true);
     }
 
-    /// Waits for them, with a bound.
-    pub(crate) fn wait_for_end(&self) {
+    /// Waits for them, with a bound. Gives how they left the outputs.
+    pub(crate) fn wait_for_end(&self) -> Rest {
         let longest = Duration::from_millis(CLOSE_WAIT_MS + self.shared.plan.timeout_ms);
         if self.ended.lock().recv_timeout(longest) == Err(mpsc::RecvTimeoutError::Timeout) {
             tracing::warn!(bus = %self.shared.plan.bus, "the bus did not end in time");
         }
+        self.rest()
+    }
+
+    fn rest(&self) -> Rest {
+        let plan = &self.shared.plan;
+        let mut rest = Rest::held(plan.bus.clone());
+        if plan.on_stop == OnStop::Hold {
+            return rest;
+        }
+        rest.wanted = OnStop::Safe;
+        let rests = self.shared.rests.lock();
+        for planned in plan.points.iter().filter(|planned| planned.safe.is_some()) {
+            let lane = self.units.binary_search(&planned.unit_id).unwrap_or(0) % self.posts.len().max(1);
+            rest.outputs += 1;
+            match rests.get(&lane) {
+                Some(None) => rest.confirmed += 1,
+                Some(Some(reason)) => rest.reason = Some(reason.clone()),
+                None => rest.reason = Some("there was no connection to the device at the end".to_owned()),
+            }
+        }
+        rest
     }
 }
 

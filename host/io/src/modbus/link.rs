@@ -80,6 +80,8 @@ pub(crate) struct Link {
     silent_in_row: u32,
     /// Units without function 22.
     without_mask: HashSet<u8>,
+    /// Writes that the device, or the lease of another master, refused.
+    refused: u64,
 }
 
 impl Link {
@@ -105,6 +107,7 @@ impl Link {
             quiet: HashMap::new(),
             silent_in_row: 0,
             without_mask: HashSet::new(),
+            refused: 0,
         }
     }
 
@@ -498,7 +501,16 @@ impl Link {
             }
         }
         // Failures have been reported; there is no later.
-        let _ = self.send_writes(connection).await;
+        let refused = self.refused;
+        let end = self.send_writes(connection).await;
+        let reason = if self.refused > refused {
+            Some("the device refused a value".to_owned())
+        } else if end.is_err() || self.shared.outbox.is_waiting(self.lane) {
+            Some("the device did not answer the last writes".to_owned())
+        } else {
+            None
+        };
+        self.shared.rests.lock().insert(self.lane, reason);
     }
 }
 

@@ -22,6 +22,7 @@ use crate::{
     config::OnStop,
     journal::{Journal, Line, LineEnd},
     limits::PLANT_CATCH_UP_MS_MAX,
+    rest::Rest,
     scaling::{Scaling, Signal},
     server::{PointInfo, Put, WriteStamp},
     status::{BusStatus, StatusCell},
@@ -446,7 +447,8 @@ impl SimDriver {
     }
 
     /// Brings the outputs to what the configuration says and ends the journal.
-    pub(crate) fn close(&self, now_ns: u64) {
+    pub(crate) fn close(&self, now_ns: u64) -> Rest {
+        let mut rest = Rest::held(self.status().bus);
         if self.on_stop == OnStop::Safe
             && let Ok(loop_id) = LoopId::new("on-stop")
         {
@@ -455,25 +457,26 @@ impl SimDriver {
                 term: 0,
                 seq: 0,
             };
-            match &self.model {
+            let safe: Vec<Put> = match &self.model {
                 Model::Plant(_) => {
                     let outputs = PLANT_POINTS.iter().enumerate().filter(|(_, row)| row.2 == "V");
-                    self.write(outputs.map(|(point, _)| Put::plain(point, 0.0)), &stamp, now_ns);
+                    outputs.map(|(point, _)| Put::plain(point, 0.0)).collect()
                 }
-                Model::Fopdt(processes) => {
-                    self.write(
-                        (0..processes.len()).map(|n| Put::plain(n * FOPDT_POINTS + 1, 0.0)),
-                        &stamp,
-                        now_ns,
-                    );
-                }
+                Model::Fopdt(processes) => (0..processes.len())
+                    .map(|n| Put::plain(n * FOPDT_POINTS + 1, 0.0))
+                    .collect(),
                 Model::Paced(model) => {
                     let outputs = model.signals().iter().enumerate();
                     let outputs = outputs.filter(|(_, s)| s.role == SignalRole::Sets);
-                    let safe = outputs.map(|(n, s)| Put::plain(n, 0.0_f64.clamp(s.low, s.high)));
-                    self.write(safe, &stamp, now_ns);
+                    outputs
+                        .map(|(n, s)| Put::plain(n, 0.0_f64.clamp(s.low, s.high)))
+                        .collect()
                 }
-            }
+            };
+            // A simulated device takes what it is given, at once.
+            rest.wanted = OnStop::Safe;
+            (rest.outputs, rest.confirmed) = (safe.len(), safe.len());
+            self.write(safe.into_iter(), &stamp, now_ns);
         }
         if let Model::Paced(model) = &self.model {
             model.stop();
@@ -481,6 +484,7 @@ impl SimDriver {
         if let Some(journal) = &self.journal {
             journal.close();
         }
+        rest
     }
 }
 

@@ -115,7 +115,7 @@ fn block(series: &Series, run: &[Row]) -> Option<RowBlock> {
 }
 
 /// The pieces of a block's body, with a layout that the caller may share.
-pub(super) fn rows(step_ns: u64, count: u32, layout: &Arc<Layout>, body: &[u8]) -> Result<Vec<Row>, BlockError> {
+pub(crate) fn rows(step_ns: u64, count: u32, layout: &Arc<Layout>, body: &[u8]) -> Result<Vec<Row>, BlockError> {
     let (count, outputs) = (count as usize, layout.outputs.len());
     if count > ROWS_MAX || outputs > OUTPUTS_MAX {
         return Err(BlockError::Head);

@@ -23,7 +23,7 @@ use super::{
     block::{self, BlockError, Head, RowBlock},
     file::{self, Found, Growing, Kind},
 };
-use crate::{error::Error, store::sync_parent};
+use crate::{error::Error, medium, store::sync_parent};
 
 /// Where a block lies.
 #[derive(Debug, Clone)]
@@ -131,7 +131,7 @@ impl Disk {
         let mut journal = None;
         for (number, path) in journals {
             if packed.is_some_and(|packed| number <= packed) {
-                fs::remove_file(&path).map_err(|error| Error::io("remove", &path, error))?;
+                medium::remove(&path).map_err(|error| Error::io("remove", &path, error))?;
                 continue;
             }
             journal = read_journal(&path, &mut opened)?.map(|file| (number, file)).or(journal);
@@ -251,7 +251,7 @@ impl Disk {
         self.next += 1;
         let places = self.put(0, blocks).inspect_err(|_| {
             // An empty journal that stays is read as one at the next start.
-            let _ = fs::remove_file(&path);
+            let _ = medium::remove(&path);
         })?;
         let synced = sync_parent(&path).and_then(|()| match places.first() {
             Some((_, place)) => self.segments.get(&place.segment).map_or(Ok(()), |s| s.growing.sync()),
@@ -262,7 +262,7 @@ impl Disk {
         match synced {
             Ok(()) => {
                 // One that stays is known by its number, and goes at the next start.
-                let _ = fs::remove_file(&old.path);
+                let _ = medium::remove(&old.path);
             }
             Err(error) => tracing::warn!(%error, "packed history may not outlive a loss of power"),
         }
@@ -298,7 +298,7 @@ impl Disk {
     pub(super) fn remove(&mut self, number: u64) -> Result<(), Error> {
         if let Some(segment) = self.segments.get(&number) {
             let path = &segment.growing.path;
-            fs::remove_file(path).map_err(|error| Error::io("remove", path, error))?;
+            medium::remove(path).map_err(|error| Error::io("remove", path, error))?;
         }
         self.segments.remove(&number);
         Ok(())
@@ -407,7 +407,7 @@ fn read_journal(path: &Path, opened: &mut Opened) -> Result<Option<Growing>, Err
 fn set_aside(path: &Path, error: &Error) -> Result<(), Error> {
     let aside = path.with_extension("damaged");
     tracing::error!(%error, aside = %aside.display(), "a file of the history is moved aside");
-    fs::rename(path, &aside).map_err(|error| Error::io("move away", path, error))
+    medium::rename(path, &aside).map_err(|error| Error::io("move away", path, error))
 }
 
 fn say_cut(path: &Path, lost: u64, opened: &mut Opened) {

@@ -14,7 +14,7 @@ use std::{
     sync::Arc,
 };
 
-use crate::error::Error;
+use crate::{error::Error, medium};
 
 const MAGIC: &[u8; 8] = b"bmphist1";
 
@@ -108,19 +108,15 @@ impl Growing {
     /// A new file, private to the user.
     pub(super) fn create(path: &Path) -> Result<Self, Error> {
         let make = || -> io::Result<File> {
-            let file = OpenOptions::new()
-                .read(true)
-                .write(true)
-                .create(true)
-                .truncate(true)
-                .mode(0o600)
-                .open(path)?;
-            file.write_all_at(MAGIC, 0)?;
+            let mut options = OpenOptions::new();
+            options.read(true).write(true).create(true).truncate(true).mode(0o600);
+            let file = medium::open(path, &options)?;
+            medium::write_at(&file, path, MAGIC, 0)?;
             Ok(file)
         };
         let file = make().map_err(|error| {
             // Half a file would be found at the next start, and said to be damaged.
-            let _ = std::fs::remove_file(path);
+            let _ = medium::remove(path);
             Error::io("create", path, error)
         })?;
         Ok(Self::of(path, file, MAGIC.len() as u64))
@@ -155,7 +151,7 @@ impl Growing {
 
     #[cfg(not(test))]
     fn write(&self, frames: &[u8], at: u64) -> io::Result<()> {
-        self.file.write_all_at(frames, at)
+        medium::write_at(&self.file, &self.path, frames, at)
     }
 
     #[cfg(test)]
@@ -175,18 +171,14 @@ impl Growing {
     }
 
     fn cut(&mut self, at: u64) -> Result<(), Error> {
-        self.file
-            .set_len(at)
-            .map_err(|error| Error::io("cut", &self.path, error))?;
+        medium::set_len(&self.file, &self.path, at).map_err(|error| Error::io("cut", &self.path, error))?;
         self.torn = false;
         Ok(())
     }
 
     /// Brings it to the disk.
     pub(super) fn sync(&self) -> Result<(), Error> {
-        self.file
-            .sync_data()
-            .map_err(|error| Error::io("sync", &self.path, error))
+        medium::sync_data(&self.file, &self.path).map_err(|error| Error::io("sync", &self.path, error))
     }
 }
 
@@ -258,6 +250,26 @@ fn next(reader: &mut impl io::Read, at: u64, length: u64) -> io::Result<Option<F
         body_check,
         end,
     }))
+}
+
+/// The whole frames of a file's bytes, head and body, up to the first that is none.
+pub(crate) fn frames(bytes: &[u8]) -> Vec<(Vec<u8>, &[u8])> {
+    let mut frames = Vec::new();
+    if !bytes.starts_with(MAGIC) {
+        return frames;
+    }
+    let mut at = MAGIC.len();
+    while let Some(rest) = bytes.get(at..)
+        && let Ok(Some(found)) = next(&mut &*rest, at as u64, bytes.len() as u64)
+        && let (Ok(from), Ok(end)) = (usize::try_from(found.body_at), usize::try_from(found.end))
+    {
+        let body = bytes.get(from..end).unwrap_or_default();
+        if crc32fast::hash(body) == found.body_check {
+            frames.push((found.head, body));
+        }
+        at = end;
+    }
+    frames
 }
 
 /// A body; none where its bytes are not those that were written.

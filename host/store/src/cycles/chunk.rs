@@ -26,7 +26,7 @@ const HEAD_BYTES: usize = 1 + 4 + CHECK_BYTES;
 
 /// Why a chunk cannot be read.
 #[derive(Debug, PartialEq, Eq, thiserror::Error)]
-pub(super) enum ChunkError {
+pub(crate) enum ChunkError {
     #[error("the chunk is cut")]
     Cut,
     #[error("the chunk has version {0}; version {ROW_VERSION} is known")]
@@ -57,20 +57,24 @@ pub(super) fn weight(record: &Record) -> usize {
 }
 
 /// The chunk of some records.
-pub(super) fn encode(records: &[Arc<Record>]) -> Result<Vec<u8>, postcard::Error> {
+pub(crate) fn encode(records: &[Arc<Record>]) -> Result<Vec<u8>, postcard::Error> {
     let plain = postcard::to_allocvec(records)?;
-    let body = lz4_flex::block::compress(&plain);
     let length = u32::try_from(plain.len()).map_err(|_| postcard::Error::SerializeBufferFull)?;
+    Ok(sealed(length, &lz4_flex::block::compress(&plain)))
+}
+
+/// The chunk of a body that says to have so many bytes before compression.
+pub(crate) fn sealed(length: u32, body: &[u8]) -> Vec<u8> {
     let mut chunk = Vec::with_capacity(HEAD_BYTES + body.len());
     chunk.push(ROW_VERSION);
     chunk.extend(length.to_le_bytes());
-    chunk.extend(check(&body));
+    chunk.extend(check(body));
     chunk.extend(body);
-    Ok(chunk)
+    chunk
 }
 
 /// The records of a chunk.
-pub(super) fn decode(chunk: &[u8]) -> Result<Vec<Arc<Record>>, ChunkError> {
+pub(crate) fn decode(chunk: &[u8]) -> Result<Vec<Arc<Record>>, ChunkError> {
     let (version, rest) = chunk.split_first().ok_or(ChunkError::Cut)?;
     if *version != ROW_VERSION {
         return Err(ChunkError::Version(*version));

@@ -6,6 +6,7 @@ mod audit;
 mod cycles;
 mod failing_disk;
 mod files;
+mod kept;
 mod killed;
 pub(crate) mod mortal;
 mod rows;

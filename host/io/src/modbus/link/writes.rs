@@ -34,6 +34,7 @@ impl Link {
                 Ok(back) => self.written(&batch, back),
                 Err(Failure::Exception(exception)) => {
                     self.answered(batch.unit_id);
+                    self.refused += 1;
                     self.report(&format!("write to {}: {exception}", self.place(&batch)));
                     let now_ns = self.shared.clock.now_ns();
                     for wish in &batch.wishes {
@@ -44,6 +45,7 @@ impl Link {
                 }
                 Err(failure @ Failure::Fenced) => {
                     // Whoever is master has its own wishes; these would be old when this host is it again.
+                    self.refused += 1;
                     let place = format!("write to {}", self.place(&batch));
                     self.failed(connection, batch.unit_id, &place, failure)?;
                 }
