@@ -1,41 +1,51 @@
-//! Guests made from core modules in text form, and the frames that they are given.
+//! Guests made from core modules in text form.
 //!
 //! The base module is a law with one input (port 0, "in") and one output (port 1, "out"): the state is the sum of all
 //! inputs as 8 bytes, and the output is that sum. A test replaces the body of a function to make a guest misbehave.
 //! Addresses: 0..1024 return areas, 1024..4096 the descriptor, from 65,536 what `cabi_realloc` gives out.
+//! Never: runs one; whoever has an engine does.
 
-use std::sync::Arc;
-
-use bumpless_core::{Cycle, Frame, Mode, Reading};
-use bumpless_engine::{Config, Engine, Instance, Limits, Prepared};
 use wit_component::{ComponentEncoder, StringEncoding, embed_component_metadata};
 use wit_parser::Resolve;
 
-/// Far longer than any honest guest takes, also on a busy machine.
-pub(crate) const PATIENCE_NS: u64 = 10_000_000_000;
+use crate::Error;
 
-/// What a test changes about the base module.
-#[derive(Clone)]
-pub(crate) struct Guest {
-    pub(crate) name: &'static str,
-    pub(crate) out_name: &'static str,
-    pub(crate) pages: u32,
-    pub(crate) start_section: &'static str,
-    pub(crate) describe: String,
-    pub(crate) start: String,
-    pub(crate) step: String,
-    pub(crate) migrate: String,
-    pub(crate) extra: String,
+/// What a test changes about the base module. Texts are WebAssembly text.
+#[derive(Debug, Clone)]
+pub struct Guest {
+    /// Name in the descriptor.
+    pub name: String,
+    /// Name of the second port.
+    pub out_name: String,
+    /// First memory, in pages of 64 KiB.
+    pub pages: u32,
+    /// Fields at the module's end, such as `(start $begin)`.
+    pub start_section: String,
+    /// Body of `describe`.
+    pub describe: String,
+    /// Body of `start`.
+    pub start: String,
+    /// Body of `step`.
+    pub step: String,
+    /// Body of `migrate`.
+    pub migrate: String,
+    /// Fields before the functions: globals, functions, data.
+    pub extra: String,
+    /// Body of the function behind `step` that gives its memory back.
+    pub post: String,
+    /// Body of `cabi_realloc`.
+    pub realloc: String,
 }
 
 impl Guest {
     /// The law that behaves.
-    pub(crate) fn good() -> Self {
+    #[must_use]
+    pub fn good() -> Self {
         Self {
-            name: "sum",
-            out_name: "out",
+            name: "sum".into(),
+            out_name: "out".into(),
             pages: 2,
-            start_section: "",
+            start_section: String::new(),
             describe: "(i32.const 1024)".into(),
             // The first state is 8 bytes at 512: the sum is what the actuator holds.
             start: "(f64.store (i32.const 512) (f64.load (local.get $track)))
@@ -44,10 +54,14 @@ impl Guest {
             step: GOOD_STEP.into(),
             migrate: "(call $ok (local.get $state) (local.get $state_len))".into(),
             extra: String::new(),
+            post: RESET.into(),
+            realloc: REALLOC.into(),
         }
     }
 
-    pub(crate) fn step(body: &str) -> Self {
+    /// The law with another step.
+    #[must_use]
+    pub fn step(body: &str) -> Self {
         Self {
             step: body.into(),
             ..Self::good()
@@ -55,19 +69,29 @@ impl Guest {
     }
 
     /// Core module text → component bytes, by the interfaces in `wit/`.
-    pub(crate) fn build(&self) -> Vec<u8> {
-        let mut module = wat::parse_str(self.text()).expect("the guest's text");
-        let mut resolve = Resolve::default();
-        let wit = concat!(env!("CARGO_MANIFEST_DIR"), "/../../wit");
-        let (package, _) = resolve.push_path(wit).expect("wit/");
-        let world = resolve.select_world(&[package], Some("controller")).expect("world");
-        embed_component_metadata(&mut module, &resolve, world, StringEncoding::UTF8).expect("metadata");
-        ComponentEncoder::default()
-            .module(&module)
-            .expect("module")
-            .validate(true)
-            .encode()
-            .expect("component")
+    ///
+    /// # Panics
+    /// Where the texts are no module: a test's own mistake.
+    #[must_use]
+    #[allow(clippy::panic, reason = "a test's own text; `encoded` is for texts from elsewhere")]
+    pub fn build(&self) -> Vec<u8> {
+        self.encoded().unwrap_or_else(|error| panic!("{error}"))
+    }
+
+    /// As [`Guest::build`].
+    ///
+    /// # Errors
+    /// [`Error::Guest`] with the reason.
+    pub fn encoded(&self) -> Result<Vec<u8>, Error> {
+        componentize(&wat::parse_str(self.text()).map_err(|error| no_guest(&error))?)
+    }
+
+    /// The base module's imports and exports, with bodies that do nothing: the shape that others may fill.
+    ///
+    /// # Errors
+    /// [`Error::Guest`].
+    pub fn shape() -> Result<Vec<u8>, Error> {
+        wat::parse_str(Self::good().text()).map_err(|error| no_guest(&error))
     }
 
     fn text(&self) -> String {
@@ -79,6 +103,8 @@ impl Guest {
             step,
             migrate,
             extra,
+            post,
+            realloc,
             ..
         } = self;
         let descriptor: String = self.descriptor().iter().map(|b| format!("\\{b:02x}")).collect();
@@ -99,10 +125,7 @@ impl Guest {
   (global $heap (mut i32) (i32.const 65536))
   (data (i32.const 1024) "{descriptor}")
   (func (export "cabi_realloc") (param i32 i32 i32) (param $bytes i32) (result i32)
-    (local $at i32)
-    (local.set $at (global.get $heap))
-    (global.set $heap (i32.and (i32.add (i32.add (local.get $at) (local.get $bytes)) (i32.const 15)) (i32.const -16)))
-    (local.get $at))
+{realloc})
   (func $ok (param $at i32) (param $len i32) (result i32)
     (i32.store (i32.const 0) (i32.const 0))
     (i32.store (i32.const 4) (local.get $at))
@@ -130,7 +153,7 @@ impl Guest {
     (param $parameters i32) (param $parameters_len i32) (param $track i32) (param $track_len i32) (result i32)
     {migrate})
   (func (export "cabi_post_bumpless:control/control@0.1.0#start") (param i32) (global.set $heap (i32.const 65536)))
-  (func (export "cabi_post_bumpless:control/control@0.1.0#step") (param i32) (global.set $heap (i32.const 65536)))
+  (func (export "cabi_post_bumpless:control/control@0.1.0#step") (param i32) {post})
   (func (export "cabi_post_bumpless:control/control@0.1.0#migrate") (param i32) (global.set $heap (i32.const 65536)))
   {start_section}
 )"#
@@ -144,13 +167,13 @@ impl Guest {
         let (ports, parameters) = (AT + 48, AT + 48 + 64);
         let mut texts = Vec::new();
         let mut text = |s: &str| {
-            let at = parameters + 56 + u32::try_from(texts.len()).unwrap();
+            let at = parameters + 56 + wasm_len(texts.len());
             texts.extend_from_slice(s.as_bytes());
-            [at.to_le_bytes(), u32::try_from(s.len()).unwrap().to_le_bytes()].concat()
+            [at.to_le_bytes(), wasm_len(s.len()).to_le_bytes()].concat()
         };
         let pair = |a: u32, b: u32| [a.to_le_bytes(), b.to_le_bytes()].concat();
         let mut bytes = [
-            text(self.name),
+            text(&self.name),
             text("1.2.3"),
             text("a test guest"),
             pair(ports, 2),
@@ -159,7 +182,7 @@ impl Guest {
         .concat();
         bytes.extend_from_slice(&7_u32.to_le_bytes());
         bytes.resize(48, 0);
-        for (name, direction) in [("in", 0_u8), (self.out_name, 1)] {
+        for (name, direction) in [("in", 0_u8), (self.out_name.as_str(), 1)] {
             bytes.extend(text(name));
             bytes.extend([direction, 0, 0, 0]);
             bytes.extend(text("bar"));
@@ -183,42 +206,40 @@ const GOOD_STEP: &str = "
     (call $write (i32.const 1) (f64.load (local.get $state)))
     (call $ok (local.get $state) (local.get $state_len))";
 
-/// An engine that compiles in this process and keeps nothing.
-pub(crate) fn engine() -> Engine {
-    engine_for(8)
+/// Everything that was given out is free again.
+const RESET: &str = "(global.set $heap (i32.const 65536))";
+
+/// Gives out what comes next, in steps of 16 bytes.
+const REALLOC: &str = "
+    (local $at i32)
+    (local.set $at (global.get $heap))
+    (global.set $heap (i32.and (i32.add (i32.add (local.get $at) (local.get $bytes)) (i32.const 15)) (i32.const -16)))
+    (local.get $at)";
+
+/// A length in the guest's memory; the texts of a descriptor are far shorter.
+fn wasm_len(bytes: usize) -> u32 {
+    u32::try_from(bytes).unwrap_or(u32::MAX)
 }
 
-pub(crate) fn engine_for(instances_max: u32) -> Engine {
-    Engine::new(Config {
-        instances_max,
-        limits: Limits::default(),
-        ..Config::default()
-    })
-    .expect("engine")
+fn no_guest(reason: &dyn std::fmt::Display) -> Error {
+    Error::Guest(format!("{reason:#}"))
 }
 
-pub(crate) fn prepare(guest: &Guest) -> Arc<Prepared> {
-    engine().prepare(&guest.build()).expect("prepare")
-}
-
-pub(crate) fn instance(guest: &Guest) -> Instance {
-    prepare(guest).instantiate().expect("instantiate")
-}
-
-pub(crate) fn frame(input: f64) -> Frame {
-    Frame {
-        cycle: Cycle {
-            seq: 7,
-            at_ns: 5000,
-            dt_ns: 100,
-            mode: Mode::Automatic,
-            setpoint: 3.0,
-        },
-        readings: vec![Reading::good(input, 4000), Reading::good(0.0, 4000)],
-        messages: vec![],
-    }
-}
-
-pub(crate) fn state(sum: f64) -> Vec<u8> {
-    sum.to_le_bytes().to_vec()
+/// Core module → component of the world `controller`, by the interfaces in `wit/`.
+///
+/// # Errors
+/// [`Error::Guest`] where it does not fit the world.
+pub fn componentize(module: &[u8]) -> Result<Vec<u8>, Error> {
+    let mut module = module.to_vec();
+    let mut resolve = Resolve::default();
+    let wit = concat!(env!("CARGO_MANIFEST_DIR"), "/../wit");
+    let (package, _) = resolve.push_path(wit).map_err(|error| no_guest(&error))?;
+    let world = resolve
+        .select_world(&[package], Some("controller"))
+        .map_err(|error| no_guest(&error))?;
+    embed_component_metadata(&mut module, &resolve, world, StringEncoding::UTF8).map_err(|error| no_guest(&error))?;
+    ComponentEncoder::default()
+        .module(&module)
+        .and_then(|encoder| encoder.validate(true).encode())
+        .map_err(|error| no_guest(&error))
 }
