@@ -6,6 +6,7 @@ pub mod check;
 pub mod components;
 pub mod page;
 pub mod product;
+pub mod sbom;
 
 mod deny;
 mod error;

@@ -3,7 +3,7 @@
 use std::process::ExitCode;
 
 use clap::Parser;
-use xtask::{Error, check, components, page, product};
+use xtask::{Error, check, components, page, product, sbom};
 
 /// Sets up, builds and checks Bumpless.
 #[derive(Parser)]
@@ -44,6 +44,11 @@ enum Command {
     },
     /// Builds the operator's page, which the next build of the program embeds. Needs Node.
     Page,
+    /// Writes what the product is made of (CycloneDX) and from what it was built (in-toto, SLSA) to target/sbom.
+    Sbom {
+        /// Files of the release; the binary of target/release and the stock components where none are named.
+        files: Vec<std::path::PathBuf>,
+    },
     /// Writes docs/openapi.json from the code.
     Openapi,
 }
@@ -57,6 +62,7 @@ fn main() -> ExitCode {
         Command::Model { arguments } => product::tool("bumpless-model", &arguments),
         Command::Simulate { arguments } => product::tool("bumpless-simulation", &arguments),
         Command::Page => page::build(),
+        Command::Sbom { files } => sbom::write(&files),
         Command::Openapi => product::openapi(),
     };
     match done {
