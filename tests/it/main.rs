@@ -21,6 +21,8 @@
 //! | refusals | bad components, loops, requests, configurations, command lines |
 //! | audit | every change leaves its entry; kill -9, tampering |
 //! | webhooks | alarms told to a receiver that is slow, away, back; and to readers at any host |
+//! | signing | whose components the cell takes |
+//! | hostile | the worst components beside a loop that must not notice |
 //! | votes | a host whose steps come out wrong, and who notices |
 //! | modbus | a real Modbus device that dies and comes back |
 //! | scada | the cell as a Modbus device: points of another host, commands to a loop |
@@ -54,6 +56,7 @@ mod door;
 mod drain;
 mod guides;
 mod history;
+mod hostile;
 mod house;
 mod lab;
 mod library;
@@ -68,6 +71,7 @@ mod refusals;
 mod restarts;
 mod rollouts;
 mod scada;
+mod signing;
 mod stock;
 mod story;
 mod votes;

@@ -37,6 +37,7 @@ mod paging;
 )]
 mod routes;
 mod server;
+mod signing;
 mod tag;
 mod trail;
 

@@ -19,6 +19,7 @@ pub(crate) mod page;
 pub(crate) mod pages;
 pub(crate) mod past;
 pub(crate) mod rollouts;
+pub(crate) mod signing;
 pub(crate) mod trend;
 
 use axum::{
@@ -41,6 +42,11 @@ pub(crate) fn all() -> Router<App> {
         .route("/v1/bundle", get(bundle::export).post(bundle::import))
         .route("/v1/components/{reference}/bytes", get(components::bytes))
         .route("/v1/components/{reference}/call", post(components::call))
+        .route("/v1/trust", get(signing::show).put(signing::put))
+        .route(
+            "/v1/signatures/{digest}",
+            get(signing::of_component).post(signing::sign),
+        )
         .route("/v1/loops", get(loops::list))
         .route(
             "/v1/loops/{name}",

@@ -16,6 +16,7 @@ mod metrics;
 mod page;
 mod rollouts;
 mod sharing;
+mod signing;
 
 use std::sync::{Arc, atomic::Ordering};
 

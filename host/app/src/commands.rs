@@ -17,4 +17,5 @@ pub(crate) mod loops;
 pub(crate) mod past;
 pub(crate) mod point_lists;
 pub(crate) mod rollouts;
+pub(crate) mod signing;
 pub(crate) mod step;

@@ -25,6 +25,7 @@ mod field;
 mod past;
 mod points;
 mod rollouts;
+mod signing;
 
 /// One host's part in the cell. Clones share it. It lives until [`Deploy::shutdown`].
 #[derive(Clone)]

@@ -23,6 +23,7 @@ use bumpless_engine::Engine;
 use bumpless_io::{Clock, IoServer};
 use bumpless_loops::LoopsEvent;
 use bumpless_store::{Archive, CycleLog, RecordWriter, Store};
+use bumpless_trust::PublicKey;
 use parking_lot::Mutex;
 use tokio::{
     runtime::Handle,
@@ -49,6 +50,7 @@ use crate::{
     roster::Roster,
     self_watch::{HostAlarms, SelfWatch},
     shadows::Shadows,
+    signing::Signing,
     telling::LastTold,
     terms::Terms,
     webhook::{self, WebhookConfig, Webhooks},
@@ -91,6 +93,8 @@ pub struct Parts {
     pub webhooks: Vec<WebhookConfig>,
     /// From when on the host's own clock and disk are alarms.
     pub host_alarms: HostAlarms,
+    /// Root keys of which one must sign the first document of trust; any may, where none is named.
+    pub trust_roots: Vec<PublicKey>,
 }
 
 /// What reaches deployment.
@@ -158,6 +162,7 @@ pub(crate) struct Room {
     pub(crate) book: Book,
     pub(crate) library: Library,
     pub(crate) bench: Bench,
+    pub(crate) signing: Signing,
     pub(crate) roster: Roster,
     pub(crate) feed: Feed,
     pub(crate) cycles: Option<Arc<CycleLog>>,
@@ -223,6 +228,7 @@ impl Room {
             audit_bytes_max,
             webhooks,
             host_alarms,
+            trust_roots,
         } = parts;
         // A host that was to stay empty over its restart says so from its first word on.
         let drain_kept = store.host_value::<bool>(drain::KEPT)?.unwrap_or(false);
@@ -254,9 +260,11 @@ impl Room {
         let terms = Terms::begin(&store, &records);
         let book = Book::open(store.clone())?;
         let library = Library::open(store.clone())?;
+        let signing = Signing::open(store.clone(), trust_roots)?;
         let room = Arc::new(Self {
             book,
             library,
+            signing,
             bench: Bench::new(engine),
             roster: Roster::new(own.clone()),
             terms,

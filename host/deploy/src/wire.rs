@@ -23,6 +23,7 @@ use crate::{
     history::{HistoryAsk, HistoryTold},
     report::{CyclesView, ReplayReport, ShadowView, Trial, TrialReport},
     rollout::RolloutView,
+    signing::TrustTold,
     view::{ApplyEnd, CommandEnd, DrainEnd, DrainOrder, PointView, Stage},
     webhook::WebhookView,
 };
@@ -106,6 +107,8 @@ pub(crate) enum Ask {
     AlarmLoad,
     /// What the host has of a loop's or a point's history.
     History(Box<HistoryAsk>),
+    /// What the host trusts: the document, and signatures.
+    Trust,
 }
 
 /// What may be asked about alarms.
@@ -248,6 +251,8 @@ pub(crate) enum Told {
     Field(Box<FieldTold>),
     /// History.
     History(Box<HistoryTold>),
+    /// What is trusted.
+    Trust(Box<TrustTold>),
     /// A component's bytes. Never written by serde: see [`encode_reply`].
     #[serde(skip)]
     Bytes(Vec<u8>),
