@@ -67,7 +67,10 @@ pub(crate) fn run(options: Options, report: &mut Report) -> Result<(), Error> {
         "{{ count = {}, gain = 1.0, tau_s = 1.0, dead_time_s = 0.1, noise = 0.002 }}",
         GOOD + 1
     );
-    let cell = Cell::start(CellOptions::first_order(&fopdt).controllers(0))?;
+    let cell = Cell::start(CellOptions {
+        plant_tables: "[roles]\ncontrol = true\n".to_owned(),
+        ..CellOptions::first_order(&fopdt).controllers(0)
+    })?;
     let api = cell.plant.api();
     api.upload_stock(&["pid"])?;
     for number in 0..GOOD {

@@ -84,6 +84,7 @@ fn only_what_is_signed_comes_in_and_starts_and_what_runs_goes_on() {
         here,
         &["keys", "trust", "ann.key", "--role", "author", "--root", "root.key"],
     );
+    on_every_host(&cell, 1);
     done(
         &other,
         here,
