@@ -3,7 +3,7 @@
 //! Never: decides; `signing` and `bumpless-trust` do.
 
 use bumpless_core::Digest;
-use bumpless_trust::{Sealed, Signature};
+use bumpless_trust::{Document, Sealed, Signature, TrustedKey};
 use serde_json::{Value, json};
 
 use super::Deploy;
@@ -12,6 +12,26 @@ use crate::{
     error::Error,
     signing::{SignaturesView, TrustView},
 };
+
+/// What an entry tells of a document: each key under its name, so that a change shows which one it is about.
+fn told(document: Option<&Document>) -> Value {
+    let Some(document) = document else { return Value::Null };
+    let key = |key: &TrustedKey| {
+        let roles: Vec<String> = key.roles.iter().map(ToString::to_string).collect();
+        let mut text = format!("{} {}", key.public.short(), roles.join(", "));
+        if let Some(revoked) = &key.revoked {
+            text.push_str(", revoked: ");
+            text.push_str(&revoked.reason);
+        }
+        (key.name.clone(), Value::from(text))
+    };
+    json!({
+        "number": document.number,
+        "policy": shown(&document.policy),
+        "needs": shown(&document.needs),
+        "keys": document.keys.iter().map(key).collect::<serde_json::Map<String, Value>>(),
+    })
+}
 
 impl Deploy {
     /// What the cell trusts, as far as this host knows.
@@ -28,13 +48,10 @@ impl Deploy {
         let room = self.room.clone();
         let asked = json!({ "number": sealed.document().map_or(0, |document| document.number) });
         let work = async move {
-            let before = room
-                .trust_view()
-                .document
-                .map_or(Value::Null, |document| shown(&document));
+            let before = told(room.trust_view().document.as_ref());
             let end = room.put_trust(sealed).await;
             let seen = match &end {
-                Ok(view) => Seen::of(before, view.document.as_ref().map_or(Value::Null, shown)),
+                Ok(view) => Seen::of(before, told(view.document.as_ref())),
                 Err(_) => Seen::default(),
             };
             (end, seen)
