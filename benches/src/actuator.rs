@@ -10,6 +10,7 @@ use bumpless_tests::Journal;
 
 use crate::{
     report::{Bound, Report},
+    spread::Spread,
     stall::Stalls,
 };
 
@@ -67,6 +68,21 @@ pub(crate) fn felt(
         }
     }
     felt
+}
+
+/// How far two writes of an actuator are from one period apart, in ns, in these times and without the machine's stalls; of all these
+/// points with their periods in ns.
+pub(crate) fn jitter(journal: &Journal, points: &[(String, u64)], spans: &[(u64, u64)], stalls: &Stalls) -> Spread {
+    let mut spread = Spread::new();
+    for (point, period_ns) in points {
+        for gap in journal.gaps(point, 0) {
+            let within = |(from_ns, to_ns): &(u64, u64)| (*from_ns..*to_ns).contains(&gap.to_ns);
+            if spans.iter().any(within) && stalls.within_ns(gap.from_ns, gap.to_ns) == 0 {
+                spread.add(gap.ns().abs_diff(*period_ns));
+            }
+        }
+    }
+    spread
 }
 
 /// A cycle that a kill cost was lost before the kill or this long after it, in ns: a cycle and its takeovers.

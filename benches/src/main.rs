@@ -16,6 +16,7 @@ mod error;
 mod failover;
 mod faults;
 mod history;
+mod hostile;
 mod io;
 mod killer;
 mod kills;
@@ -86,6 +87,8 @@ enum Bench {
     Masters,
     /// From an upload to the first cycle, what running loops feel of it, bombs, and many uploads at once.
     Upload,
+    /// Every hostile component of the table beside fifty loops at 100 Hz: jitter with and without, and memory.
+    Hostile,
     /// Virtual time: hours of the pilot plant per second and core, against the same experiment as plain functions.
     Lab,
     /// The long memory: cycles in, bytes on disk, a day on a thousand columns.
@@ -184,6 +187,7 @@ fn run(bench: &Bench, options: Options) -> Result<bool, Error> {
         Bench::Select => "select",
         Bench::Swap(_) => "swap",
         Bench::History => "history",
+        Bench::Hostile => "hostile",
         Bench::Lab => "lab",
         Bench::Programs => "programs",
         Bench::Scripts { .. } => "scripts",
@@ -212,6 +216,7 @@ fn run(bench: &Bench, options: Options) -> Result<bool, Error> {
         Bench::Swap(switching) if switching.is_wanted() => switch::run(options, *switching, &mut report)?,
         Bench::Swap(_) => swap::run(options, &mut report)?,
         Bench::History => archive::run(options, &mut report)?,
+        Bench::Hostile => hostile::run(options, &mut report)?,
         Bench::Lab => lab::run(options, &mut report)?,
         Bench::Programs => programs::run(options, &mut report)?,
         Bench::Scripts { folder } => scripts::run(folder, &mut report)?,

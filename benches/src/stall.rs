@@ -250,6 +250,13 @@ impl Stalls {
     }
 }
 
+impl Stalls {
+    /// No stall at all: nothing is taken away then.
+    pub(crate) fn none() -> Self {
+        Self::of(Vec::new(), Spread::new(), Ticks::default())
+    }
+}
+
 #[cfg(test)]
 impl Stalls {
     /// Stalls of the given times, for tests.

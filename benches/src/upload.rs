@@ -14,18 +14,18 @@ use std::{
 };
 
 use bumpless_io::Clock;
-use bumpless_tests::{Answer, Api, Cell, CellOptions, Journal};
+use bumpless_tests::{Answer, Api, Cell, CellOptions};
 use serde_json::{Value, json};
 
 use crate::{
     Options,
-    actuator::{self, Felt, felt},
+    actuator::{self, Felt, felt, jitter},
     error::Error,
     history::History,
     law,
     report::{Bound, Report},
     spread::Spread,
-    stall::{Stalls, Watch},
+    stall::Watch,
     swap::fresh,
 };
 
@@ -161,7 +161,13 @@ pub(crate) fn run(options: Options, report: &mut Report) -> Result<(), Error> {
     for (part, text) in [(0.5, "p50"), (1.0, "longest")] {
         report.told(&format!("upload.to_running_10mb.{text}"), large.us(part) / 1e3, "ms");
     }
-    let jitter = |spans: &[Span]| jitter(&journal, spans, &stalls);
+    let points: Vec<(String, u64)> = (0..OTHERS + 2)
+        .map(|number| {
+            let period_ns = if number < 2 { PERIOD_NS } else { OTHERS_PERIOD_NS };
+            (format!("plant.{number}.out"), period_ns)
+        })
+        .collect();
+    let jitter = |spans: &[Span]| jitter(&journal, &points, spans, &stalls);
     let (without, with) = (jitter(&quiet), jitter(&busy));
     let (without_large, with_large) = (jitter(&[quiet_of_two]), jitter(&[large_span]));
     for (spread, name) in [
@@ -271,21 +277,6 @@ fn wait_ready(api: &Api, digest: &str, hosts: usize) -> Result<(), Error> {
         }
         std::thread::sleep(Duration::from_millis(5));
     }
-}
-
-/// How far two writes of an actuator are from one period apart, in ns, without the machine's stalls; of every loop.
-fn jitter(journal: &Journal, spans: &[Span], stalls: &Stalls) -> Spread {
-    let mut spread = Spread::new();
-    for number in 0..OTHERS + 2 {
-        let period_ns = if number < 2 { PERIOD_NS } else { OTHERS_PERIOD_NS };
-        for gap in journal.gaps(&format!("plant.{number}.out"), 0) {
-            let within = |(from_ns, to_ns): &Span| (*from_ns..*to_ns).contains(&gap.to_ns);
-            if spans.iter().any(within) && stalls.within_ns(gap.from_ns, gap.to_ns) == 0 {
-                spread.add(gap.ns().abs_diff(period_ns));
-            }
-        }
-    }
-    spread
 }
 
 /// The law with its own code behind it, again and again, as modules that nobody instantiates: all of it is compiled. Format:

@@ -22,6 +22,8 @@
 //! | audit | every change leaves its entry; kill -9, tampering |
 //! | webhooks | alarms told to a receiver that is slow, away, back; and to readers at any host |
 //! | programs | free-running programs: paused while they spin, kill -9 of their owner; the published 3C scripts |
+//! | signing | whose components the cell takes |
+//! | hostile | the worst components beside a loop that must not notice |
 //! | votes | a host whose steps come out wrong, and who notices |
 //! | modbus | a real Modbus device that dies and comes back |
 //! | scada | the cell as a Modbus device: points of another host, commands to a loop |
@@ -57,6 +59,7 @@ mod door;
 mod drain;
 mod guides;
 mod history;
+mod hostile;
 mod house;
 mod lab;
 mod languages;
@@ -74,6 +77,7 @@ mod refusals;
 mod restarts;
 mod rollouts;
 mod scada;
+mod signing;
 mod stock;
 mod story;
 mod votes;

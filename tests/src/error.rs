@@ -89,6 +89,9 @@ pub enum Error {
         /// What the parser says.
         source: serde_json::Error,
     },
+    /// A guest that cannot be made.
+    #[error("no guest can be made of it: {0}")]
+    Guest(String),
     /// Waited in vain.
     #[error("waited {seconds:.1} s for {what}; last seen: {seen}")]
     Waited {

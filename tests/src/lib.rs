@@ -17,6 +17,7 @@ mod device;
 mod error;
 mod feed;
 mod host;
+pub mod hostile;
 mod journal;
 pub mod masters;
 mod slots;

@@ -11,6 +11,7 @@ pub mod languages;
 pub mod page;
 pub mod product;
 pub mod reference;
+pub mod sbom;
 
 mod deny;
 mod error;

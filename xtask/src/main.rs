@@ -3,7 +3,7 @@
 use std::{path::PathBuf, process::ExitCode};
 
 use clap::Parser;
-use xtask::{Error, bindings, book, check, components, fuzz, languages, page, product, reference};
+use xtask::{Error, bindings, book, check, components, fuzz, languages, page, product, reference, sbom};
 
 /// Sets up, builds and checks Bumpless.
 #[derive(Parser)]
@@ -69,6 +69,11 @@ enum Command {
     Fuzz(fuzz::Wishes),
     /// Builds the operator's page, which the next build of the program embeds. Needs Node.
     Page,
+    /// Writes what the product is made of (CycloneDX) and from what it was built (in-toto, SLSA) to target/sbom.
+    Sbom {
+        /// Files of the release; the binary of target/release and the stock components where none are named.
+        files: Vec<std::path::PathBuf>,
+    },
     /// Writes docs/openapi.json from the code.
     Openapi,
     /// Writes docs/book/wit.md from the interfaces.
@@ -103,6 +108,7 @@ fn main() -> ExitCode {
         Command::Simulate { arguments } => product::tool("bumpless-simulation", &arguments),
         Command::Fuzz(wishes) => fuzz::fuzz(&wishes),
         Command::Page => page::build(),
+        Command::Sbom { files } => sbom::write(&files),
         Command::Openapi => product::openapi(),
         Command::Wit => reference::write(),
         Command::Book => book::build(),

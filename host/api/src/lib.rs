@@ -38,6 +38,7 @@ mod program;
 )]
 mod routes;
 mod server;
+mod signing;
 mod tag;
 mod trail;
 

@@ -10,7 +10,7 @@ use crate::{
     error::Problem,
     routes::{
         alarms, audit, bundle, components, demo, field, health, history, hosts, lab, live, load, loops, pages, past,
-        programs, rollouts, trend,
+        programs, rollouts, signing, trend,
     },
     types,
 };
@@ -24,7 +24,7 @@ use crate::{
     ),
     paths(
         components::list, components::upload, components::show, components::bytes, components::relabel, components::remove, components::call,
-        bundle::export, bundle::import,
+        bundle::export, bundle::import, signing::show, signing::put, signing::of_component, signing::sign,
         loops::list, loops::show, loops::apply, loops::remove, loops::set, loops::swap, loops::rollback, loops::move_owner,
         loops::setpoint, loops::mode, loops::output,
         history::cycles, past::of_loop, past::of_point, history::replay, history::backtest,

@@ -20,6 +20,7 @@ pub(crate) mod pages;
 pub(crate) mod past;
 pub(crate) mod programs;
 pub(crate) mod rollouts;
+pub(crate) mod signing;
 pub(crate) mod trend;
 
 use axum::{
@@ -43,6 +44,11 @@ pub(crate) fn all() -> Router<App> {
         .route("/v1/components/{reference}/bytes", get(components::bytes))
         .route("/v1/components/{reference}/script", get(programs::script))
         .route("/v1/components/{reference}/call", post(components::call))
+        .route("/v1/trust", get(signing::show).put(signing::put))
+        .route(
+            "/v1/signatures/{digest}",
+            get(signing::of_component).post(signing::sign),
+        )
         .route("/v1/loops", get(loops::list))
         .route(
             "/v1/loops/{name}",

@@ -17,6 +17,7 @@ mod page;
 mod programs;
 mod rollouts;
 mod sharing;
+mod signing;
 
 use std::sync::{Arc, atomic::Ordering};
 

@@ -22,6 +22,7 @@ mod past;
 mod programs;
 mod record;
 mod rollouts;
+mod signing;
 mod words;
 
 pub use crate::routes::demo::{Demo, Fault, FaultKind};
@@ -57,6 +58,10 @@ pub use programs::{
 };
 pub use record::{Alarm, Applied, Aside, Event, LogLine, Message, Reading, Record, Redundancy, Vote};
 pub use rollouts::{OnFailure, Rollout, RolloutLoop, RolloutRequest, RolloutStage, RolloutState, Rollouts, SilentHost};
+pub use signing::{
+    ComponentSignature, KeyRole, SignRequest, Signatures, Trust, TrustDocument, TrustPolicy, TrustSeal, TrustedKey,
+    Unsigned,
+};
 pub use words::{Direction, LogLevel, Mode, OnBump, OnFault, OnFewer, PortKind, Priority, Quality, Strategy};
 
 pub(crate) use history::window;

@@ -18,6 +18,7 @@ mod library;
 mod past;
 mod program;
 mod rollout;
+mod signing;
 
 pub(crate) use alarm::{AlarmCommand, Of as AlarmOf};
 pub(crate) use audit::{AuditCommand, Format as AuditFormat, ListArgs as AuditListArgs, Noted};
@@ -29,6 +30,7 @@ pub(crate) use library::{ComponentsArgs, ComponentsCommand, FilterArgs, UploadAr
 pub(crate) use past::{FormatWord, HistoryArgs};
 pub(crate) use program::ProgramCommand;
 pub(crate) use rollout::{RolloutArgs, RolloutCommand};
+pub(crate) use signing::{KeysCommand, PassphraseArgs, PolicyWord, RoleWord, RootArgs, SignArgs, VerifyArgs};
 
 use crate::{client::Client, commands, demo, error::Error, host, watch};
 
@@ -86,6 +88,15 @@ pub(crate) enum Command {
     Upload(UploadArgs),
     /// The library: list, show, label, download, export, import, delete.
     Components(ComponentsArgs),
+    /// Keys that sign components: new, list, trust, revoke, policy.
+    Keys {
+        #[command(subcommand)]
+        what: KeysCommand,
+    },
+    /// Sign a component; the signature lies beside it, and goes with its upload.
+    Sign(SignArgs),
+    /// Check who signed a component, and whether the cell would take it.
+    Verify(VerifyArgs),
     /// Loops: apply, list, show, command, swap, roll back.
     Loop {
         #[command(subcommand)]
@@ -401,6 +412,9 @@ pub fn run(cli: Cli) -> Result<(), Error> {
         Command::Components(ComponentsArgs { filter, what }) => {
             commands::components::run(&client()?, json, what.unwrap_or(ComponentsCommand::List(filter)))
         }
+        Command::Keys { what } => commands::signing::keys(client, json, what),
+        Command::Sign(args) => commands::signing::sign(client, json, &args),
+        Command::Verify(args) => commands::signing::verify(&client()?, json, &args),
         Command::Loop { what } => commands::loops::run(&client()?, json, what),
         Command::Program { what } => commands::programs::run(&client()?, json, what),
         Command::Rollout { what } => commands::rollouts::run(&client()?, json, what),
@@ -464,6 +478,13 @@ mod tests {
             "bumpless components import laws.tar --force",
             "bumpless --json components show pid@1.0.0",
             "bumpless components download pid -o x.wasm",
+            "bumpless keys new ann -o ann.key --passphrase-file secret",
+            "bumpless keys list",
+            "bumpless keys trust ann.key --role author --role approver --expires-days 365 --root root.key",
+            "bumpless keys revoke ann --reason stolen --root root.key",
+            "bumpless keys policy required --needs author,approver --root root.key",
+            "bumpless sign pid.wasm --key ann.key --role author --expires-days 90 --send",
+            "bumpless verify pid.wasm",
             "bumpless loop apply loop.toml",
             "bumpless loop set pressure setpoint=1.5 k=2 strategy=p2c --api http://127.0.0.1:1",
             "bumpless loop setpoint t -5",
@@ -554,6 +575,8 @@ mod tests {
             ("bumpless components label pid", "<KEY=VALUE|KEY->"),
             ("bumpless components label pid stage", "KEY- to remove it"),
             ("bumpless components export pid", "--output"),
+            ("bumpless keys trust ann.key --root root.key", "--role"),
+            ("bumpless sign pid.wasm --key k --passphrase x", "unexpected argument"),
             ("bumpless loop set pressure", "KEY=VALUE"),
             ("bumpless loop set pressure setpoint", "write it as KEY=VALUE"),
             ("bumpless loop shadows pressure --stop", "<ID>"),

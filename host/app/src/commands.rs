@@ -19,6 +19,7 @@ pub(crate) mod past;
 pub(crate) mod point_lists;
 pub(crate) mod programs;
 pub(crate) mod rollouts;
+pub(crate) mod signing;
 pub(crate) mod step;
 
 /// Reads a loop file's text. `path` is for messages.

@@ -220,6 +220,7 @@ pub async fn run(config: Config, faults: Option<mpsc::Sender<Fault>>) -> Result<
         audit_bytes_max: config.audit_bytes_max,
         webhooks: config.webhooks.clone(),
         host_alarms: config.host_alarms,
+        trust_roots: config.trust_roots.clone(),
     })
     .map_err(|e| Error::start("deployment", e))?;
     // Set once, here; nobody else could have.

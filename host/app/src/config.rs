@@ -37,6 +37,9 @@
 //! [audit]                          # who changed what
 //! bytes_max_mib = 256              # then the oldest entries go, and an entry says so
 //!
+//! [trust]                          # whose components the cell takes: see docs/signing.md
+//! roots = []                       # root keys of which one must sign the first document; any may, where none is named
+//!
 //! [alarms]                         # of the host itself
 //! clock_offset_max_ms = 1000
 //! disk_free_min_mib = 512
@@ -79,11 +82,13 @@ mod history;
 mod itself;
 mod lab;
 mod testing;
+mod trust;
 
 use crate::{error::Error, realtime::Realtime};
 use history::HistoryTable;
 use lab::LabTable;
 use testing::TestingTable;
+use trust::TrustTable;
 
 /// Bytes of a configuration file: thousands of points fit; a mistaken path to a large file does not.
 const FILE_BYTES_MAX: u64 = 16 * 1024 * 1024;
@@ -129,6 +134,8 @@ pub struct Config {
     pub host_alarms: HostAlarms,
     /// Who is told of alarms.
     pub webhooks: Vec<WebhookConfig>,
+    /// Root keys of which one must sign the first document of trust.
+    pub trust_roots: Vec<bumpless_trust::PublicKey>,
     /// How long they are kept, in ns.
     pub cycles_keep_ns: u64,
     /// Bounds of the thinned history; none to keep none.
@@ -174,6 +181,8 @@ pub(crate) struct File {
     audit: AuditTable,
     #[serde(default)]
     alarms: HostAlarms,
+    #[serde(default)]
+    trust: TrustTable,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     webhook: Vec<WebhookConfig>,
     #[serde(default, skip_serializing_if = "TestingTable::is_empty")]
@@ -407,6 +416,7 @@ impl File {
             otlp: self.otlp,
             lab_reports: self.lab.reports(folder),
             audit_bytes_max: self.audit.checked(&wrong)?,
+            trust_roots: self.trust.roots(&wrong)?,
             host_alarms: itself::alarms(self.alarms, &wrong)?,
             webhooks: itself::webhooks(self.webhook, folder, &wrong)?,
             history_bytes_max: kept.cycles_bytes_max,

@@ -180,6 +180,22 @@ impl Admission {
         Ok(())
     }
 
+    /// Adds a warning that is none of the trial's own; a report that passed is one that warns then.
+    pub fn warn(&mut self, text: &str) {
+        let finding = Finding {
+            severity: Severity::Warning,
+            text: text.chars().take(TEXT_CHARS_MAX).collect(),
+        };
+        let place = self
+            .findings
+            .partition_point(|known| known.severity >= Severity::Warning);
+        self.findings.insert(place, finding);
+        self.findings.truncate(FINDINGS_MAX);
+        if self.verdict == Verdict::Passed {
+            self.verdict = Verdict::Warned;
+        }
+    }
+
     /// Do the measured steps fit a limit, in ns? Half of it is near: the host that steps may be half as fast as the one
     /// that measured.
     #[must_use]

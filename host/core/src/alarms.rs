@@ -78,6 +78,8 @@ pub enum Kind {
     Clock,
     /// A host's disk is nearly full, or refuses what it is given.
     Disk,
+    /// A loop runs a component that is not signed as the cell asks.
+    Signature,
 }
 
 impl Kind {

@@ -36,6 +36,7 @@ pub mod guard;
 pub mod history;
 pub mod indices;
 pub mod lease;
+pub mod patience;
 pub mod place;
 pub mod seat;
 pub mod select;

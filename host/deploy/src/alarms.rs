@@ -236,11 +236,11 @@ impl Room {
         }
         if let AlarmAct::Define(definition) = &act
             && own
-            && !matches!(definition.kind, Kind::Clock | Kind::Disk)
+            && !matches!(definition.kind, Kind::Clock | Kind::Disk | Kind::Signature)
         {
             return Err(Error::invalid(
                 format!("alarm {alarm:?}: {loop_id} is a host and no loop"),
-                "a host has alarms of the kinds clock and disk",
+                "a host has alarms of the kinds clock, disk and signature",
             ));
         }
         if let AlarmAct::Define(definition) = &act

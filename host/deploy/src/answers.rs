@@ -74,6 +74,7 @@ impl Room {
                 }
                 Ask::Shadow(id, ask) => self.shadow_here(&from, id, ask).await,
                 Ask::Alarm(ask) => self.alarms_here(ask).await,
+                Ask::Trust => Ok(self.trust_told()),
                 Ask::Webhooks => Ok(Told::Webhooks(self.webhooks.views())),
                 Ask::AlarmLoad => self.alarm_load_here().await.map(Box::new).map(Told::AlarmLoad),
                 Ask::Audit(ask) => self.audit_here(ask).await,

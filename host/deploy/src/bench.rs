@@ -192,6 +192,7 @@ impl Room {
     }
 
     async fn compiled(self: &Arc<Self>, digest: Digest, first: Option<&HostId>) -> Result<Arc<Prepared>, Error> {
+        self.may_load(&digest)?;
         let bytes = self.bytes_of(digest, first).await?;
         self.bench.compiling.lock().insert(digest);
         let _compiling = Compiling(&self.bench, digest);
@@ -274,7 +275,9 @@ impl Room {
             let fallbacks = room.book.all().into_iter().filter_map(|intent| intent.current.fallback);
             let newest = infos.iter().take(PREPARED_AHEAD_MAX).map(|info| info.digest);
             let next = fallbacks.chain(newest).find(|digest| {
-                !room.bench.is_ready(digest) && failed.get(digest).is_none_or(|(_, again)| *again <= now)
+                !room.bench.is_ready(digest)
+                    && room.may_load(digest).is_ok()
+                    && failed.get(digest).is_none_or(|(_, again)| *again <= now)
             });
             let Some(digest) = next else {
                 continue;

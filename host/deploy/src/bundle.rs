@@ -14,6 +14,7 @@ mod oci;
 use std::{collections::BTreeMap, io::Cursor};
 
 use bumpless_core::{ComponentInfo, Digest, limits::COMPONENT_BYTES_MAX};
+use bumpless_trust::{SIGNATURES_MAX, Signature};
 use serde::{Serialize, de::DeserializeOwned};
 
 use crate::{
@@ -33,7 +34,12 @@ pub(crate) struct Parcel {
     pub(crate) bytes: Vec<u8>,
     pub(crate) note: String,
     pub(crate) labels: BTreeMap<String, String>,
+    /// As they stand in the file; whoever takes them in judges them.
+    pub(crate) signatures: Vec<Signature>,
 }
+
+/// Signatures of components.
+pub(crate) type Signed = BTreeMap<Digest, Vec<Signature>>;
 
 /// One entry of a bundle: what it is called there, and what it is or why it is nothing.
 pub(crate) type Entry = (String, Result<Parcel, Error>);
@@ -68,7 +74,7 @@ fn json<T: Serialize>(value: &T) -> Result<Vec<u8>, Error> {
 ///
 /// # Errors
 /// [`Error::Invalid`] for none, too many, or more than 128 MiB.
-pub(crate) fn pack(components: Vec<(ComponentInfo, Vec<u8>)>) -> Result<Vec<u8>, Error> {
+pub(crate) fn pack(components: Vec<(ComponentInfo, Vec<u8>)>, signed: &Signed) -> Result<Vec<u8>, Error> {
     if components.is_empty() || components.len() > BUNDLE_COMPONENTS_MAX {
         return Err(Error::invalid(
             format!(
@@ -91,7 +97,11 @@ pub(crate) fn pack(components: Vec<(ComponentInfo, Vec<u8>)>) -> Result<Vec<u8>,
     let mut files = Files(Vec::new());
     let mut manifests = Vec::new();
     for (info, bytes) in components {
-        let config = files.blob(CONFIG_TYPE, json(&Config::from(&info))?);
+        let mut config = Config::from(&info);
+        if let (Some(about), Some(signatures)) = (&mut config.bumpless, signed.get(&info.digest)) {
+            about.signatures.clone_from(signatures);
+        }
+        let config = files.blob(CONFIG_TYPE, json(&config)?);
         let layer = files.blob(COMPONENT_TYPE, bytes);
         let manifest = Manifest {
             schema_version: 2,
@@ -285,15 +295,17 @@ fn parcel(files: &BTreeMap<String, &[u8]>, content: &Content) -> Result<Parcel, 
             .get(DESCRIPTION)
             .or_else(|| content.annotations.get(DESCRIPTION))
     };
-    let (note, labels) = match config.bumpless {
-        Some(about) => (about.note, about.labels),
-        None => (described().cloned().unwrap_or_default(), BTreeMap::new()),
+    let (note, labels, mut signatures) = match config.bumpless {
+        Some(about) => (about.note, about.labels, about.signatures),
+        None => (described().cloned().unwrap_or_default(), BTreeMap::new(), Vec::new()),
     };
+    signatures.truncate(SIGNATURES_MAX);
     Ok(Parcel {
         digest: Digest::of(&bytes),
         bytes,
         note,
         labels,
+        signatures,
     })
 }
 

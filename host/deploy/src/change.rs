@@ -284,7 +284,11 @@ impl Room {
         let facts = |point: &_| self.point_facts(point, &id);
         let spec = plan::spec(draft, info.digest, &info.descriptor, &self.ground(&facts))?;
         self.check_fallback(&spec, info, fallback)?;
-        let warnings = admission::warnings(info, &spec, false)?;
+        let mut warnings = admission::warnings(info, &spec, false)?;
+        warnings.extend(self.may_start(info, false)?);
+        if let Some(fallback) = fallback {
+            warnings.extend(self.may_start(fallback, false)?);
+        }
         if self.book.len() >= LOOPS_MAX {
             return Err(Error::busy(
                 format!("the cell has {LOOPS_MAX} loops, the most it may have"),
@@ -361,6 +365,12 @@ impl Room {
         let known = intent.revisions().any(ran) || current.fallback == Some(spec.digest);
         let mut warnings = admission::warnings(info, &spec, known)?;
         warnings.extend(dropped.notes.iter().cloned());
+        let goes_on = current.digest == spec.digest || current.fallback == Some(spec.digest);
+        warnings.extend(self.may_start(info, goes_on)?);
+        if let Some(digest) = spec.fallback.filter(|digest| current.fallback != Some(*digest)) {
+            let fallback = self.info_of(digest, None).await?;
+            warnings.extend(self.may_start(&fallback, false)?);
+        }
         let end = |revision, unchanged, hand_over| ApplyEnd {
             id: id.clone(),
             revision,

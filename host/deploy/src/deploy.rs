@@ -26,6 +26,7 @@ mod past;
 mod points;
 mod programs;
 mod rollouts;
+mod signing;
 
 /// One host's part in the cell. Clones share it. It lives until [`Deploy::shutdown`].
 #[derive(Clone)]

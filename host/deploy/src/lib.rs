@@ -55,6 +55,7 @@ mod roster;
 mod self_watch;
 mod service;
 mod shadows;
+mod signing;
 mod sync;
 mod telling;
 mod terms;
@@ -88,6 +89,7 @@ pub use health::{Check, HealthView};
 pub use library::plant_bytes;
 pub use room::{DeployArrival, Parts};
 pub use self_watch::HostAlarms;
+pub use signing::{SignaturesView, TrustView};
 pub use view::{
     ApplyEnd, Call, CallEnd, CommandEnd, ComponentView, Counters, DrainEnd, DrainOrder, FailureView, HandOverView,
     HostView, Imported, LoopView, PointView, Relabel, Stage, StageView, Upload,

@@ -23,6 +23,7 @@ use bumpless_engine::Engine;
 use bumpless_io::{Clock, IoServer};
 use bumpless_loops::LoopsEvent;
 use bumpless_store::{Archive, CycleLog, RecordWriter, Store};
+use bumpless_trust::PublicKey;
 use parking_lot::Mutex;
 use tokio::{
     runtime::Handle,
@@ -50,6 +51,7 @@ use crate::{
     roster::Roster,
     self_watch::{HostAlarms, SelfWatch},
     shadows::Shadows,
+    signing::Signing,
     telling::LastTold,
     terms::Terms,
     webhook::{self, WebhookConfig, Webhooks},
@@ -92,6 +94,8 @@ pub struct Parts {
     pub webhooks: Vec<WebhookConfig>,
     /// From when on the host's own clock and disk are alarms.
     pub host_alarms: HostAlarms,
+    /// Root keys of which one must sign the first document of trust; any may, where none is named.
+    pub trust_roots: Vec<PublicKey>,
 }
 
 /// What reaches deployment.
@@ -159,6 +163,7 @@ pub(crate) struct Room {
     pub(crate) book: Book,
     pub(crate) library: Library,
     pub(crate) bench: Bench,
+    pub(crate) signing: Signing,
     pub(crate) roster: Roster,
     pub(crate) feed: Feed,
     pub(crate) cycles: Option<Arc<CycleLog>>,
@@ -225,6 +230,7 @@ impl Room {
             audit_bytes_max,
             webhooks,
             host_alarms,
+            trust_roots,
         } = parts;
         // A host that was to stay empty over its restart says so from its first word on.
         let drain_kept = store.host_value::<bool>(drain::KEPT)?.unwrap_or(false);
@@ -257,9 +263,11 @@ impl Room {
         let book = Book::open(store.clone())?;
         let library = Library::open(store.clone())?;
         let programs = Programs::open(&store)?;
+        let signing = Signing::open(store.clone(), trust_roots)?;
         let room = Arc::new(Self {
             book,
             library,
+            signing,
             bench: Bench::new(engine),
             roster: Roster::new(own.clone()),
             terms,

@@ -162,7 +162,8 @@ impl Room {
             .boards
             .lock()
             .entry(id.clone())
-            .or_insert_with(Board::of_host);
+            .or_insert_with(Board::of_host)
+            .complete(Board::of_host());
         let mut tick = every(SELF_LOOK_EVERY);
         loop {
             tick.tick().await;
@@ -193,6 +194,9 @@ impl Room {
         let full = free.is_none_or(|free| free < limits.disk_free_min_mib << 20);
         if full || self.self_watch.refuses(self.writes_refused()) {
             so.push(Kind::Disk);
+        }
+        if !self.wanting().is_empty() {
+            so.push(Kind::Signature);
         }
         let events: Vec<AlarmEvent> = {
             let mut boards = self.alarms.boards.lock();

@@ -59,7 +59,7 @@ impl Room {
         match notice {
             Notice::Standing { library, intents } => {
                 let marks = (*library, *intents);
-                let ours = (self.library.mark(), self.book.mark());
+                let ours = (self.library_mark(), self.book.mark());
                 let mut comparing = self.comparing.lock();
                 if marks == ours {
                     comparing.done.remove(from);
@@ -83,7 +83,7 @@ impl Room {
         match notice {
             Notice::Standing { library, intents } => {
                 let compared = self.compare(from).await;
-                let ours = (self.library.mark(), self.book.mark());
+                let ours = (self.library_mark(), self.book.mark());
                 let mut comparing = self.comparing.lock();
                 comparing.now.remove(from);
                 if compared.is_ok() {
@@ -124,6 +124,8 @@ impl Room {
             Ok(_) => end = Err(Error::internal("the answer is no library")),
             Err(error) => end = Err(error),
         }
+        // Before the intents: what a loop starts must be judged by what is known by then.
+        end = end.and(self.compare_trust(from).await);
         match self.ask(from, Ask::Intents, ANSWER_WAIT).await {
             Ok(Told::Intents(heads, gone)) => {
                 for tombstone in gone {
@@ -173,6 +175,7 @@ impl Room {
 
     pub(crate) async fn component_gone(&self, digest: Digest, at_ms: u64) -> Result<(), Error> {
         if self.library.remove(digest, at_ms).await? {
+            self.signing.forget(&digest).await?;
             self.bench.forget(&digest);
         }
         Ok(())

@@ -61,7 +61,7 @@ impl Room {
     pub(crate) fn announce_standing(&self) {
         self.told.lock().standing = Some(Instant::now());
         self.announce(&Notice::Standing {
-            library: self.library.mark(),
+            library: self.library_mark(),
             intents: self.book.mark(),
         });
     }

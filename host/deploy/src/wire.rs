@@ -25,6 +25,7 @@ use crate::{
     programs::{ProgramAsk, ProgramTold},
     report::{CyclesView, ReplayReport, ShadowView, Trial, TrialReport},
     rollout::RolloutView,
+    signing::TrustTold,
     view::{ApplyEnd, CommandEnd, DrainEnd, DrainOrder, PointView, Stage},
     webhook::WebhookView,
 };
@@ -110,6 +111,8 @@ pub(crate) enum Ask {
     History(Box<HistoryAsk>),
     /// About programs at home or running there.
     Program(Box<ProgramAsk>),
+    /// What the host trusts: the document, and signatures.
+    Trust,
 }
 
 /// What may be asked about alarms.
@@ -254,6 +257,8 @@ pub(crate) enum Told {
     History(Box<HistoryTold>),
     /// What was asked about programs.
     Program(Box<ProgramTold>),
+    /// What is trusted.
+    Trust(Box<TrustTold>),
     /// A component's bytes. Never written by serde: see [`encode_reply`].
     #[serde(skip)]
     Bytes(Vec<u8>),

@@ -226,7 +226,8 @@ impl Worker {
             None => old.instance.step(&running.frame, &running.state, limit_ns),
         };
         if let Err(fault) = &old_step {
-            seat.remember_overrun(&running, fault);
+            let spent_ns = self.shared.now_ns().saturating_sub(began_ns);
+            seat.remember_fault(&running, fault, spent_ns);
         }
         let mut attempt = match place(seat, revision) {
             Some(new_index) if new_index != old_index => {

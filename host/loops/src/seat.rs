@@ -24,6 +24,7 @@ use crate::{
 };
 use bumpless_core::{
     Event as CycleEvent, Fault, Frame, HostId, LoopId, Reading, Record, Redundancy,
+    patience::Patience,
     protocol::{Answer, Sample, StepAnswer},
     seat::{self, Ask, Attempts, Base, Conclusion, Standing, Stepped},
     select, swap,
@@ -80,6 +81,8 @@ pub(crate) struct Seat {
     pub(crate) judged: Vec<Judged>,
     /// A step here or for us that ran past its limit: revision, the record that it went on from, and the fault.
     overran: Option<(u64, (u64, u64), Fault)>,
+    /// What dear faults of its component have cost so far.
+    patience: Patience,
     recent: VecDeque<Asked>,
     owned: bool,
 }
@@ -91,10 +94,20 @@ impl Seat {
 
     /// A step that runs past its limit may end too late for its cycle; then the next one must not try it again, or nobody
     /// would ever hear of it: no record, no policy, no way back, and no other revision either.
-    pub(crate) fn remember_overrun(&mut self, running: &Running, fault: &Fault) {
+    /// What is dear besides is tried less often, for it takes its time from the other loops of this thread.
+    pub(crate) fn remember_fault(&mut self, running: &Running, fault: &Fault, step_ns: u64) {
+        let (revision, seq) = (running.sample.revision, running.sample.seq);
+        let period_ns = self.held(revision).map_or(0, |held| held.spec.period_ns);
+        self.patience.faulted(revision, seq, period_ns, fault, step_ns);
         if matches!(fault, Fault::Overrun { .. }) {
             self.overran = Some((running.sample.revision, running.sample.last, fault.clone()));
         }
+    }
+
+    /// The fault that the sample's cycle ends with because its component rests, and when that is tried again.
+    fn rests(&self, sample: &Sample) -> Option<(Fault, u64)> {
+        let (fault, next) = self.patience.rests(sample.revision, sample.seq)?;
+        Some((fault.clone(), next))
     }
 
     pub(crate) fn waits_for(&self, host: &HostId) -> bool {
@@ -247,10 +260,15 @@ impl Worker {
         let Some(index) = seat.held.iter().position(|h| h.spec.revision == sample.revision) else {
             return self.decline(&sample, "the revision in force is not prepared here yet");
         };
-        let held = &mut seat.held[index];
+        let held = &seat.held[index];
         if sample.readings.len() != held.wiring.points.len() {
             return self.decline(&sample, "the sample's readings do not fit the component's ports");
         }
+        if !sample.commands.is_empty() {
+            seat.patience.commanded();
+        }
+        let rests = seat.rests(&sample);
+        let held = &mut seat.held[index];
         let limit_ns = held.spec.step_limit_ns();
         let actuators = track(held, &sample.readings);
         let standing = seat::settle(base.as_deref(), &held.spec, &sample, &actuators);
@@ -258,34 +276,44 @@ impl Worker {
         let mut events = Vec::new();
         let bad_input = held.wiring.bad_input(&sample.readings);
         let carried = seat::carried(base.as_deref(), &held.spec, &held.wiring, &sample.readings);
-        let state: Result<Arc<[u8]>, Fault> = match carried {
-            Some(state) => Ok(Arc::clone(state)),
-            None => take_over(held, None, &actuators, limit_ns).map(|(state, _)| Arc::from(state)),
+        let state: Result<Arc<[u8]>, Fault> = match (carried, &rests) {
+            (Some(state), _) => Ok(Arc::clone(state)),
+            (None, Some((fault, _))) => Err(fault.clone()),
+            (None, None) => {
+                let taken = take_over(held, None, &actuators, limit_ns).map(|(state, _)| Arc::from(state));
+                if let Err(fault) = &taken {
+                    let spent_ns = self.shared.now_ns().saturating_sub(started_ns);
+                    let period_ns = held.spec.period_ns;
+                    seat.patience
+                        .faulted(sample.revision, sample.seq, period_ns, fault, spent_ns);
+                }
+                taken
+            }
         };
         // The same cycle in all but its number: last time its end came too late for its commit, and no record says so yet.
         let again = seat
             .overran
             .as_ref()
             .filter(|(revision, after, _)| (*revision, *after) == (sample.revision, sample.last))
-            .map(|(.., fault)| fault.clone());
-        let fault = match (&state, bad_input) {
-            (_, Some(port)) => {
+            .map(|(.., fault)| (fault.clone(), fault.to_string()));
+        let rests = rests.map(|(fault, next)| {
+            let text = format!("{fault}; it is not tried again before cycle {next}");
+            (fault, text)
+        });
+        let fault = match (state.as_ref().err(), bad_input, rests.or(again)) {
+            (_, Some(port), _) => {
                 events.push(CycleEvent::BadInput(port));
                 Some(missing_input(held, port))
             }
-            (Err(fault), None) => {
-                events.push(CycleEvent::Faulted {
-                    replica: self.shared.here.clone(),
-                    fault: fault.to_string(),
-                });
-                Some(fault.clone())
-            }
-            (Ok(_), None) => again.inspect(|fault| {
-                events.push(CycleEvent::Faulted {
-                    replica: self.shared.here.clone(),
-                    fault: fault.to_string(),
-                });
-            }),
+            (failed, None, known) => known
+                .or_else(|| failed.map(|fault| (fault.clone(), fault.to_string())))
+                .map(|(fault, text)| {
+                    events.push(CycleEvent::Faulted {
+                        replica: self.shared.here.clone(),
+                        fault: text,
+                    });
+                    fault
+                }),
         };
         let left_ns = sample.left_ns;
         let here_at_ns = started_ns + (left_ns as f64 * HERE_PART) as u64;
@@ -369,7 +397,7 @@ impl Worker {
                         Err(fault) => {
                             let replica = self.shared.here.clone();
                             if let Some(seat) = self.seats.get_mut(id) {
-                                seat.remember_overrun(&running, &fault);
+                                seat.remember_fault(&running, &fault, step_ns);
                             }
                             running.events.push(CycleEvent::Faulted {
                                 replica,
@@ -483,7 +511,7 @@ impl Worker {
                 // A host that is not ready is no worse for it, only of no use now; a fault is the component's.
                 self.shared.replicas.answered(&asked.host, latency_ns);
                 if let Some(seat) = self.seats.get_mut(&id) {
-                    seat.remember_overrun(&running, &fault);
+                    seat.remember_fault(&running, &fault, answer.step_ns);
                 }
                 running.events.push(CycleEvent::Faulted {
                     replica: asked.host,
@@ -532,13 +560,16 @@ impl Worker {
     ) {
         let now_ns = self.shared.now_ns();
         let Some(seat) = self.seats.get_mut(id) else { return };
-        let Some(held) = seat.held.get(index) else { return };
+        if step.is_ok() {
+            seat.patience.good();
+        }
         for asked in running.asked {
             if seat.recent.len() == RECENT_MAX {
                 seat.recent.pop_front();
             }
             seat.recent.push_back(asked);
         }
+        let Some(held) = seat.held.get(index) else { return };
         let record = seat::conclude(Conclusion {
             owner: &self.shared.here,
             sample: &running.sample,

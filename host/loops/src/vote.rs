@@ -91,11 +91,11 @@ impl Worker {
         let Some(running) = self.ask_voters(id, running, ballot) else {
             return;
         };
-        let Some((step, _)) = self.step_here(id, &running) else {
+        let Some((step, step_ns)) = self.step_here(id, &running) else {
             return;
         };
         if let (Err(fault), Some(seat)) = (&step, self.seats.get_mut(id)) {
-            seat.remember_overrun(&running, fault);
+            seat.remember_fault(&running, fault, step_ns);
         }
         self.voted_here(id, running, step);
     }

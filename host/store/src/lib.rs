@@ -7,7 +7,7 @@
 //! ```text
 //! <dir>/                     0700
 //!   lock                     held while a process has the store open; names that process
-//!   host.redb                infos, intents, tombstones, last records, rollouts, alarms, forces, settings
+//!   host.redb                infos, intents, tombstones, last records, rollouts, trust, alarms, forces, settings
 //!   cycles.redb              every record of the loops at home here, up to a bound
 //!   audit/<number>.jsonl     who changed what, a chain of lines, up to a bound
 //!   history/                 thinned history of loops and points, up to a bound
@@ -44,6 +44,7 @@ mod rollouts;
 mod settings;
 mod store;
 mod terms;
+mod trust;
 mod writer;
 
 pub use alarms::ALARM_CHANGES_MAX;

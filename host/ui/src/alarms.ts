@@ -85,6 +85,7 @@ export const KINDS: Record<string, string> = {
   controller: "raised by the controller",
   clock: "a host's clock is off",
   disk: "a disk is full or fails",
+  signature: "a loop runs a component that is not signed as the cell asks",
 };
 export const LEVELS = ["hi-hi", "hi", "lo", "lo-lo"];
 export const has_limit = (kind: string): boolean => LEVELS.includes(kind) || kind === "deviation" || kind === "rate";

@@ -39,6 +39,8 @@ pub enum AlarmKind {
     Clock,
     /// A host's disk is nearly full, or refuses what it is given.
     Disk,
+    /// A loop runs a component that is not signed as the cell asks.
+    Signature,
 }
 
 /// Where an alarm is in its life.
@@ -87,7 +89,8 @@ both_ways!(
     Dissent,
     Controller,
     Clock,
-    Disk
+    Disk,
+    Signature
 );
 both_ways!(AlarmState, core::State, Normal, Active, Acknowledged, Returned, Latched);
 

@@ -11,7 +11,7 @@ use bumpless_api::types::{CallAnswer, CallRequest, Component, Components, Direct
 use bumpless_core::limits::COMPONENT_BYTES_MAX;
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::library;
+use super::{library, signing};
 use crate::{
     cli::{CallArgs, ComponentsCommand, FilterArgs, UploadArgs},
     client::{Client, encoded},
@@ -36,6 +36,10 @@ pub(crate) fn upload(client: &Client, json: bool, args: &UploadArgs) -> Result<(
     if args.file.extension().is_some_and(|extension| extension == "lua") {
         let stem = args.file.file_stem().unwrap_or_default().to_string_lossy();
         query.push_str(&format!("&script={}", encoded(&stem)));
+    }
+    // First, so that a cell that asks for signatures has them.
+    if !args.dry_run {
+        signing::send(client, &args.file)?;
     }
     let (component, text) = send(client, &args.file, &query, std::io::stderr().is_terminal() && !json)?;
     if json {

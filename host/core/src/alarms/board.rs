@@ -196,12 +196,13 @@ impl Board {
         }
     }
 
-    /// The board of a host, which is no loop: its clock, and its disk.
+    /// The board of a host, which is no loop: its clock, its disk, and what it runs unsigned.
     #[must_use]
     pub fn of_host() -> Self {
         let alarms = [
             ("clock", Kind::Clock, Priority::Medium),
             ("disk", Kind::Disk, Priority::High),
+            ("signature", Kind::Signature, Priority::Medium),
         ];
         let one = |(name, kind, priority)| {
             let definition = Definition {
@@ -214,6 +215,13 @@ impl Board {
             alarms: alarms.into_iter().map(one).collect(),
             controllers: BTreeMap::new(),
             recent_ns: VecDeque::new(),
+        }
+    }
+
+    /// Takes the alarms of another board that this one, kept by an earlier version, does not have.
+    pub fn complete(&mut self, other: Self) {
+        for (name, standing) in other.alarms {
+            self.alarms.entry(name).or_insert(standing);
         }
     }
 

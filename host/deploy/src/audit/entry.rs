@@ -75,6 +75,10 @@ kinds! {
     ComponentRelabel = "component.relabel",
     /// A component was removed.
     ComponentRemove = "component.remove",
+    /// Signatures of a component.
+    ComponentSign = "component.sign",
+    /// Another document of trust.
+    TrustChange = "trust.change",
     /// A bundle of components.
     ComponentImport = "component.import",
     /// A rollout was begun.

@@ -5,6 +5,7 @@
 use std::collections::BTreeMap;
 
 use bumpless_core::{ComponentInfo, Descriptor};
+use bumpless_trust::Signature;
 use serde::{Deserialize, Serialize};
 
 /// Says that a folder is an image layout.
@@ -112,6 +113,8 @@ pub(super) struct About {
     pub(super) uploaded_at_unix_ms: u64,
     #[serde(default)]
     pub(super) descriptor: Option<Descriptor>,
+    #[serde(default)]
+    pub(super) signatures: Vec<Signature>,
 }
 
 impl From<&ComponentInfo> for Config {
@@ -134,6 +137,7 @@ impl From<&ComponentInfo> for Config {
                 uploaded_by: info.uploaded_by.clone(),
                 uploaded_at_unix_ms: info.uploaded_at_unix_ms,
                 descriptor: Some(info.descriptor.clone()),
+                signatures: Vec::new(),
             }),
         }
     }

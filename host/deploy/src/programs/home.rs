@@ -239,6 +239,10 @@ impl Room {
                 "name a component of the world program, or a script",
             ));
         }
+        let goes_on = self.programs.users(&info.digest).contains(&id);
+        if let Some(words) = self.may_start(&info, goes_on)? {
+            tracing::warn!(program = %id, "{words}");
+        }
         let mut grants = BTreeMap::new();
         for (name, grant) in draft.grants {
             let point =

@@ -55,6 +55,7 @@ impl Room {
                 "",
             ));
         }
+        self.may_load(&spec.digest)?;
         let bytes = self.bytes_of(spec.digest, Some(from)).await?;
         let engine = self.bench.engine.clone();
         let (prepared, _) = on_disk(move || engine.programs().open(&bytes))

@@ -67,12 +67,12 @@ fn what_is_no_controller_is_refused_in_words() {
         bytes
     };
     let name_lie = Guest {
-        name: "Not A Name",
+        name: "Not A Name".into(),
         ..Guest::good()
     }
     .build();
     let twice = Guest {
-        out_name: "in",
+        out_name: "in".into(),
         ..Guest::good()
     }
     .build();
@@ -93,13 +93,13 @@ fn what_is_no_controller_is_refused_in_words() {
     .build();
     let start_traps = Guest {
         extra: "(func $begin (unreachable))".into(),
-        start_section: "(start $begin)",
+        start_section: "(start $begin)".into(),
         ..Guest::good()
     }
     .build();
     let start_spins = Guest {
         extra: "(func $begin (loop $l (br $l)))".into(),
-        start_section: "(start $begin)",
+        start_section: "(start $begin)".into(),
         ..Guest::good()
     }
     .build();

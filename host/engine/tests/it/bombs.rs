@@ -2,83 +2,15 @@
 //!
 //! The limits are small here, so that a test is short; what is tested is that they hold.
 
-use std::{fmt::Write as _, time::Duration};
+use std::time::Duration;
 
 use bumpless_engine::{Engine, Error, Limits};
+use bumpless_tests::hostile::bombs::{deep_nesting, huge_tables, long_lives, many_functions, much_data};
 
 use crate::{
     child::{engine_with, leftovers, this_binary},
     guest::{Guest, PATIENCE_NS, frame, state},
 };
-
-fn with(extra: String) -> Vec<u8> {
-    Guest { extra, ..Guest::good() }.build()
-}
-
-/// Functions by the ten thousand, none of which is ever called.
-pub(crate) fn many_functions(count: u32) -> Vec<u8> {
-    let mut text = String::new();
-    for n in 0..count {
-        let _infallible = write!(
-            text,
-            "(func (param i64 i64) (result i64) (i64.add (i64.mul (local.get 0) (i64.const {n})) (local.get 1)))"
-        );
-    }
-    with(text)
-}
-
-/// One function whose every block jumps to everywhere.
-fn huge_tables(tables: u32, targets: u32) -> Vec<u8> {
-    let targets = (0..targets).map(|n| (n % 4).to_string()).collect::<Vec<_>>().join(" ");
-    let mut text = "(func (param i32)".to_owned();
-    for _ in 0..tables {
-        let _infallible = write!(
-            text,
-            "(block (block (block (block (br_table {targets} 0 (local.get 0))))))"
-        );
-    }
-    text.push(')');
-    with(text)
-}
-
-/// Blocks in blocks.
-fn deep_nesting(depth: usize) -> Vec<u8> {
-    // The text form is read recursively, so each level is written flat.
-    let text = format!(
-        "(func (param i32) (result i32) {} local.get 0 {})",
-        "block (result i32) ".repeat(depth),
-        "end ".repeat(depth)
-    );
-    with(text)
-}
-
-/// One function in which every value lives to its end.
-fn long_lives(values: u32) -> Vec<u8> {
-    let mut text = "(func (param f64) (result f64) ".to_owned();
-    for n in 0..values {
-        let _infallible = write!(text, "(f64.mul (local.get 0) (f64.const {n})) ");
-    }
-    for _ in 1..values {
-        text.push_str("f64.add ");
-    }
-    text.push(')');
-    with(text)
-}
-
-/// Megabytes to copy into each instance.
-fn much_data(mib: u32) -> Vec<u8> {
-    let bytes = "x".repeat(1024 * 1024);
-    let mut text = String::new();
-    for n in 0..mib {
-        let _infallible = write!(text, "(data (i32.const {}) \"{bytes}\")", 131_072 + n * 1024 * 1024);
-    }
-    Guest {
-        extra: text,
-        pages: 2 + mib * 16,
-        ..Guest::good()
-    }
-    .build()
-}
 
 /// The engine still takes an honest component.
 fn goes_on(engine: &Engine) {

@@ -107,7 +107,7 @@ fn code_under_another_key_or_another_name_is_not_ours() {
     let (one, other) = (
         Guest::good().build(),
         Guest {
-            name: "other",
+            name: "other".into(),
             ..Guest::good()
         }
         .build(),
@@ -134,7 +134,7 @@ fn what_is_refused_or_forgotten_is_not_kept() {
     engine
         .inspect(
             &Guest {
-                name: "Not A Name",
+                name: "Not A Name".into(),
                 ..Guest::good()
             }
             .build(),
@@ -163,7 +163,15 @@ fn the_oldest_code_goes_first() {
     })
     .unwrap();
     for (age_s, name) in [(30, "a"), (20, "b"), (10, "c")] {
-        let found = engine.inspect(&Guest { name, ..Guest::good() }.build()).unwrap();
+        let found = engine
+            .inspect(
+                &Guest {
+                    name: name.into(),
+                    ..Guest::good()
+                }
+                .build(),
+            )
+            .unwrap();
         let made = files(dir.path())
             .into_iter()
             .find(|p| p.to_str().unwrap().contains(&found.digest.to_string()));
@@ -175,7 +183,7 @@ fn the_oldest_code_goes_first() {
     assert_eq!(left.len(), 2);
     let first = Digest::of(
         &Guest {
-            name: "a",
+            name: "a".into(),
             ..Guest::good()
         }
         .build(),

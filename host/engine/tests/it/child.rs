@@ -94,7 +94,7 @@ fn a_child_out_of_memory_is_named_as_such() {
     };
     let error = engine_with(&dir, 1, limits, this_binary())
         .unwrap()
-        .inspect(&crate::bombs::many_functions(20_000))
+        .inspect(&bumpless_tests::hostile::bombs::many_functions(20_000))
         .unwrap_err();
     assert_eq!(
         error.to_string(),

@@ -16,7 +16,7 @@ fn instances_are_refused_beyond_the_limit_and_places_come_back() {
     engine
         .inspect(
             &Guest {
-                name: "other",
+                name: "other".into(),
                 ..Guest::good()
             }
             .build(),
@@ -47,7 +47,7 @@ fn a_guest_that_fails_at_its_start_gives_its_place_back() {
     // so it must be a trap in each; the description then fails already.
     let bytes = Guest {
         extra: "(func $begin (unreachable))".into(),
-        start_section: "(start $begin)",
+        start_section: "(start $begin)".into(),
         ..Guest::good()
     }
     .build();
@@ -86,7 +86,7 @@ fn the_table_of_components_is_bounded() {
     .unwrap();
     let first = Guest::good().build();
     let second = Guest {
-        name: "other",
+        name: "other".into(),
         ..Guest::good()
     }
     .build();

@@ -9,6 +9,7 @@ mod cache;
 mod calls;
 mod child;
 mod guest;
+mod hostile;
 mod lifecycle;
 mod misdeeds;
 mod stock;

@@ -5,6 +5,7 @@
 mod acknowledged;
 mod bench;
 mod degraded;
+mod patience;
 mod probation;
 mod rebound;
 mod votes;
