@@ -21,6 +21,7 @@
 //! | refusals | bad components, loops, requests, configurations, command lines |
 //! | audit | every change leaves its entry; kill -9, tampering |
 //! | webhooks | alarms told to a receiver that is slow, away, back; and to readers at any host |
+//! | access | accounts, tokens, TLS, a closed bus, and attacks on them |
 //! | votes | a host whose steps come out wrong, and who notices |
 //! | modbus | a real Modbus device that dies and comes back |
 //! | scada | the cell as a Modbus device: points of another host, commands to a loop |
@@ -40,6 +41,7 @@
     reason = "a test fails loudly"
 )]
 
+mod access;
 mod alarms;
 mod api;
 mod audit;

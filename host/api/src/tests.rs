@@ -3,6 +3,7 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "tests")]
 
+pub(crate) mod access;
 pub(crate) mod alarms;
 pub(crate) mod audit;
 mod candidates;

@@ -2,8 +2,10 @@
 //!
 //! Never: decide; what the cell refuses is an error with the cell's own words.
 
+pub(crate) mod access;
 pub(crate) mod alarms;
 pub(crate) mod audit;
+pub(crate) mod ca;
 pub(crate) mod components;
 pub(crate) mod curves;
 pub(crate) mod history;

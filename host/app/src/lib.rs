@@ -18,6 +18,7 @@ mod demo;
 mod error;
 mod host;
 mod log;
+mod proof;
 mod show;
 mod stop;
 mod watch;

@@ -78,6 +78,7 @@ impl Room {
                 Ask::AlarmLoad => self.alarm_load_here().await.map(Box::new).map(Told::AlarmLoad),
                 Ask::Audit(ask) => self.audit_here(ask).await,
                 Ask::History(ask) => self.history_here(*ask).await.map(Box::new).map(Told::History),
+                Ask::Access => Ok(Told::Access(Box::new((*self.keyring.register()).clone()))),
                 Ask::Rollout(ask) => self.rollout_here(ask).await,
                 Ask::Field(ask) => self.field_here(*ask).await.map(Box::new).map(Told::Field),
                 Ask::Records(ids) => {

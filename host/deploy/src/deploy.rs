@@ -18,6 +18,7 @@ use crate::{
     wire::{Ask, Told},
 };
 
+mod access;
 mod alarms;
 mod audit;
 mod changes;
@@ -25,6 +26,8 @@ mod field;
 mod past;
 mod points;
 mod rollouts;
+
+pub use access::{AccountDraft, SignedIn};
 
 /// One host's part in the cell. Clones share it. It lives until [`Deploy::shutdown`].
 #[derive(Clone)]

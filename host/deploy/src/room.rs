@@ -31,6 +31,7 @@ use tokio::{
 };
 
 use crate::{
+    access::Keyring,
     alarms::Alarms,
     audit::Audit,
     bench::Bench,
@@ -91,6 +92,8 @@ pub struct Parts {
     pub webhooks: Vec<WebhookConfig>,
     /// From when on the host's own clock and disk are alarms.
     pub host_alarms: HostAlarms,
+    /// Must everybody who asks the API say who he is?
+    pub secured: bool,
 }
 
 /// What reaches deployment.
@@ -167,6 +170,7 @@ pub(crate) struct Room {
     pub(crate) alarms: Alarms,
     pub(crate) terms: Terms,
     pub(crate) audit: Audit,
+    pub(crate) keyring: Keyring,
     pub(crate) webhooks: Webhooks,
     pub(crate) self_watch: SelfWatch,
     pub(crate) commissioning: Commissioning,
@@ -223,6 +227,7 @@ impl Room {
             audit_bytes_max,
             webhooks,
             host_alarms,
+            secured,
         } = parts;
         // A host that was to stay empty over its restart says so from its first word on.
         let drain_kept = store.host_value::<bool>(drain::KEPT)?.unwrap_or(false);
@@ -267,6 +272,7 @@ impl Room {
             rollouts: Ledger::default(),
             alarms: Alarms::default(),
             audit,
+            keyring: Keyring::open(store.clone(), secured)?,
             webhooks,
             self_watch: SelfWatch::new(host_alarms),
             commissioning: Commissioning::new(&store, clock)?,

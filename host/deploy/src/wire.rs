@@ -6,6 +6,7 @@
 
 use std::collections::BTreeMap;
 
+use bumpless_access::Register;
 use bumpless_core::{
     Command, ComponentInfo, Digest, Edition, HostId, Intent, LoopId, LoopSpec, PointId, Reading, Record, alarms::Flood,
 };
@@ -28,7 +29,7 @@ use crate::{
 };
 
 /// Version of these lists. Another one is refused in words, so that a half updated cell says what is the matter.
-const VERSION: u8 = 4;
+const VERSION: u8 = 5;
 
 /// A position of an intent among its copies: see [`Intent::position`].
 pub(crate) type Position = (u64, u64);
@@ -106,6 +107,8 @@ pub(crate) enum Ask {
     AlarmLoad,
     /// What the host has of a loop's or a point's history.
     History(Box<HistoryAsk>),
+    /// Who may do what.
+    Access,
 }
 
 /// What may be asked about alarms.
@@ -248,6 +251,8 @@ pub(crate) enum Told {
     Field(Box<FieldTold>),
     /// History.
     History(Box<HistoryTold>),
+    /// Who may do what.
+    Access(Box<Register>),
     /// A component's bytes. Never written by serde: see [`encode_reply`].
     #[serde(skip)]
     Bytes(Vec<u8>),
@@ -260,7 +265,7 @@ pub(crate) enum Notice {
     Standing {
         /// Of the library.
         library: u64,
-        /// Of the intents.
+        /// Of the intents and of the accounts.
         intents: u64,
     },
     /// A component came, or what people wrote about it changed.

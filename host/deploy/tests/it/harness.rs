@@ -159,6 +159,7 @@ impl Cell {
             audit_bytes_max: 64 * 1024 * 1024,
             webhooks: vec![],
             host_alarms: bumpless_deploy::HostAlarms::default(),
+            secured: false,
         })
         .expect("deployment starts");
         *field.deploy.lock() = Some(started.clone());

@@ -118,6 +118,7 @@ pub(crate) async fn host(cell: &Cell, dir: &std::path::Path) -> Real {
         audit_bytes_max: 64 * 1024 * 1024,
         webhooks: vec![],
         host_alarms: bumpless_deploy::HostAlarms::default(),
+        secured: false,
     })
     .unwrap();
     *slot.lock() = Some(deploy.clone());
