@@ -481,8 +481,8 @@ fn attacks_on_the_wire_are_answered_or_cut_off_and_the_host_goes_on() {
             "an oversized body",
             head(
                 "POST /v1/loops/l/setpoint",
-                &format!("{bearer}content-type: application/json\r\ncontent-length: 300000\r\n"),
-            ) + &" ".repeat(300_000),
+                &format!("{bearer}content-type: application/json\r\ncontent-length: 262200\r\n"),
+            ) + &" ".repeat(262_200),
             "413",
         ),
         (

@@ -235,6 +235,8 @@ mod tests {
             let (status, answer) = example_answer(&method, &asked, example.get("request")).await;
             if !(200..300).contains(&status) {
                 wrong.push(format!("{method} {asked}: {status} {answer}"));
+            } else if update && asked.starts_with("/v1/access/") && shape(&example["answer"]) == shape(&answer) {
+                // Its secrets are drawn anew each time; an example stays.
             } else if update {
                 example["status"] = status.into();
                 if !answer.is_null() {

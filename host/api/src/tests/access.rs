@@ -1,196 +1,15 @@
 //! Who may do what, over HTTP: every route of the document against every role, and what a guard turns away.
 
-use std::{collections::HashMap, sync::PoisonError, time::Duration};
+use std::{collections::HashMap, time::Duration};
 
 use axum::http::{HeaderValue, Method};
-use bumpless_access::{
-    Account, AccountChange, Need, Principal, Reach, Register, Role, Scope, Session, Sessions, Token, TokenDraft,
-    UserName,
-};
-use bumpless_deploy::{AccountDraft, SignedIn};
+use bumpless_access::{Need, Reach, Role, Scope};
 
-use super::*;
+use super::{guests::name, *};
 use crate::{
-    access::{Access, Done},
-    cell::Answer,
+    access::Access,
     needs::{self, Who},
 };
-
-/// Who is known to the cell in memory: a register, sessions, and what was refused. Passwords are kept as they are.
-#[derive(Default)]
-pub(crate) struct Guests {
-    pub(crate) secured: bool,
-    pub(crate) first: bool,
-    register: Register,
-    passwords: HashMap<String, String>,
-    sessions: Sessions,
-    refused: Vec<(String, String, String)>,
-}
-
-const NOW: Duration = Duration::from_secs(1);
-
-fn name(text: &str) -> UserName {
-    UserName::new(text).expect("a name")
-}
-
-impl Guests {
-    fn add(&mut self, who: &str, role: Role, scope: Scope) {
-        let change = AccountChange {
-            role: Some(role),
-            scope: Some(scope),
-            password: Some("$argon2id$".to_owned()),
-            ..AccountChange::default()
-        };
-        self.register.add(name(who), change, "test", 1).expect("an account");
-        self.passwords.insert(who.to_owned(), format!("password of {who}"));
-    }
-
-    fn token(&mut self, who: &str) -> String {
-        let draft = TokenDraft {
-            role: None,
-            scope: Scope::All,
-            days: 1,
-            note: String::new(),
-        };
-        self.register.issue(&name(who), draft, "test", 0).expect("a token").0
-    }
-
-    fn enter(&mut self, who: &str, password: &str) -> Option<SignedIn> {
-        if self.passwords.get(who).is_none_or(|known| known != password) {
-            return None;
-        }
-        let (_, stamp) = self.register.password(&name(who))?;
-        let (cookie, session) = self.sessions.begin(name(who), stamp, NOW).ok()?;
-        let principal = self.register.by_stamp(&name(who), stamp)?;
-        Some(SignedIn {
-            cookie,
-            session,
-            principal,
-        })
-    }
-}
-
-fn change(draft: AccountDraft) -> AccountChange {
-    AccountChange {
-        role: draft.role,
-        scope: draft.scope,
-        password: draft.password.map(|_| "$argon2id$".to_owned()),
-        disabled: draft.disabled,
-        note: draft.note,
-    }
-}
-
-impl Fake {
-    fn guests<T>(&self, work: impl FnOnce(&mut Guests) -> T) -> T {
-        work(&mut self.guests.lock().unwrap_or_else(PoisonError::into_inner))
-    }
-
-    fn done<T: Send + 'static>(&self, end: Result<T, bumpless_access::Error>) -> Answer<T> {
-        match end {
-            Ok(value) => self.answer(value),
-            Err(error) => Box::pin(async move { Err(error.into()) }),
-        }
-    }
-}
-
-impl Access for Fake {
-    fn is_secured(&self) -> bool {
-        self.guests(|guests| guests.secured)
-    }
-
-    fn awaits_first(&self) -> bool {
-        self.guests(|guests| guests.first)
-    }
-
-    fn by_token(&self, text: &str) -> Option<Principal> {
-        self.guests(|guests| guests.register.by_token(text, 1))
-    }
-
-    fn by_cookie(&self, cookie: &str) -> Option<(Principal, Session)> {
-        self.guests(|guests| {
-            let session = guests.sessions.using(cookie, NOW)?;
-            Some((guests.register.by_stamp(&session.name, session.stamp)?, session))
-        })
-    }
-
-    fn sign_in(&self, name: String, password: String) -> Answer<Option<SignedIn>> {
-        let end = self.guests(|guests| guests.enter(&name, &password));
-        self.answer(end)
-    }
-
-    fn first_sign_in(&self, token: String, name: String, password: String) -> Answer<Option<SignedIn>> {
-        let end = self.guests(|guests| {
-            if token != "first" || !guests.first {
-                return None;
-            }
-            guests.first = false;
-            guests.add(&name, Role::Admin, Scope::All);
-            guests.passwords.insert(name.clone(), password.clone());
-            guests.enter(&name, &password)
-        });
-        self.answer(end)
-    }
-
-    fn sign_out(&self, cookie: &str) {
-        self.guests(|guests| guests.sessions.end(cookie));
-    }
-
-    fn note_refusal(&self, what: String, reason: String) -> Done {
-        let by = bumpless_deploy::audit::Asker::current().by;
-        self.guests(|guests| guests.refused.push((by, what, reason)));
-        Box::pin(async {})
-    }
-
-    fn accounts(&self) -> Vec<Account> {
-        self.guests(|guests| guests.register.accounts().cloned().collect())
-    }
-
-    fn tokens(&self) -> Vec<Token> {
-        self.guests(|guests| guests.register.tokens().cloned().collect())
-    }
-
-    fn add_account(&self, who: String, draft: AccountDraft) -> Answer<Account> {
-        let end = self.guests(|guests| {
-            guests.register.add(UserName::new(&who)?, change(draft), "h", 1)?;
-            guests.register.account(&name(&who)).cloned()
-        });
-        self.done(end)
-    }
-
-    fn change_account(&self, who: String, draft: AccountDraft) -> Answer<Account> {
-        let end = self.guests(|guests| {
-            guests.register.change(&UserName::new(&who)?, change(draft), "h", 1)?;
-            guests.register.account(&name(&who)).cloned()
-        });
-        self.done(end)
-    }
-
-    fn change_password(&self, who: String, old: String, new: String) -> Answer<bool> {
-        let good = self.guests(|guests| {
-            let good = guests.passwords.get(&who) == Some(&old);
-            if good {
-                guests.passwords.insert(who, new);
-            }
-            good
-        });
-        self.answer(good)
-    }
-
-    fn remove_account(&self, who: String) -> Answer<()> {
-        let end = self.guests(|guests| guests.register.remove(&UserName::new(&who)?, "h", 1));
-        self.done(end)
-    }
-
-    fn issue_token(&self, who: String, draft: TokenDraft) -> Answer<(String, Token)> {
-        let end = self.guests(|guests| guests.register.issue(&UserName::new(&who)?, draft, "h", 0));
-        self.done(end)
-    }
-
-    fn revoke_token(&self, id: String) -> Answer<Token> {
-        let end = self.guests(|guests| guests.register.revoke(&id));
-        self.done(end)
-    }
-}
 
 /// A host that asks who one is, with an account and a token of each role, and `a-only`, an engineer of the loop `a`.
 fn secured() -> (Bench, HashMap<&'static str, String>) {
@@ -212,6 +31,24 @@ fn with_token(mut request: Request<Body>, token: &str) -> Request<Body> {
     let value = HeaderValue::try_from(format!("Bearer {token}")).expect("plain");
     request.headers_mut().insert(header::AUTHORIZATION, value);
     request
+}
+
+/// Makes a host that asks of the bench, and the request one of its administrator's, for the examples of the document.
+pub(super) fn in_session(bench: &Bench, request: &mut Request<Body>) {
+    let signed = bench.cell.guests(|guests| {
+        (guests.secured, guests.first) = (true, true);
+        guests.add("root", Role::Admin, Scope::All);
+        guests.add("eve", Role::Engineer, Scope::Loops(vec!["tank-*".to_owned()]));
+        guests.token("eve");
+        guests.enter("root", "password of root").expect("an account")
+    });
+    let headers = request.headers_mut();
+    let cookie = format!("bumpless={}", signed.cookie.text());
+    headers.insert(header::COOKIE, HeaderValue::try_from(cookie).expect("plain"));
+    headers.insert(
+        "x-csrf-token",
+        HeaderValue::try_from(signed.session.csrf).expect("plain"),
+    );
 }
 
 /// Every operation of the document: method, pattern, an address of it.

@@ -64,7 +64,7 @@ pub(crate) struct Fake {
     pub(crate) news: broadcast::Sender<bumpless_deploy::commissioning::FieldEvent>,
     pub(crate) alarm_news: broadcast::Sender<Arc<AlarmEvent>>,
     pub(crate) trail: Mutex<super::audit::Trail>,
-    pub(crate) guests: Mutex<super::access::Guests>,
+    pub(crate) guests: Mutex<super::guests::Guests>,
     records: broadcast::Sender<Arc<Record>>,
 }
 

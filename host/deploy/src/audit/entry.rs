@@ -155,7 +155,7 @@ pub struct AuditEntry {
     pub at: String,
     /// What was done: see [`AuditKind::name`].
     pub what: String,
-    /// Who did it, as he said of himself; empty where nobody said.
+    /// Who did it: the account, or on a host that asks nobody what he said of himself; empty where nobody said.
     pub by: String,
     /// How he reached the host: see [`super::Via::name`].
     pub via: String,
