@@ -24,6 +24,7 @@
 //! | programs | free-running programs: paused while they spin, kill -9 of their owner; the published 3C scripts |
 //! | signing | whose components the cell takes |
 //! | hostile | the worst components beside a loop that must not notice |
+//! | access | accounts, tokens, TLS, a closed bus, and attacks on them |
 //! | votes | a host whose steps come out wrong, and who notices |
 //! | modbus | a real Modbus device that dies and comes back |
 //! | scada | the cell as a Modbus device: points of another host, commands to a loop |
@@ -46,6 +47,7 @@
     reason = "a test fails loudly"
 )]
 
+mod access;
 mod alarms;
 mod api;
 mod audit;

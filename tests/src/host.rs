@@ -230,7 +230,10 @@ impl HostProcess {
             .into_iter()
             .find(|list| !list.is_empty())
             .map_or_else(|| quoted(&["tcp/127.0.0.1:0".to_owned()]), |list| quoted(list));
-        let api = match (self.api.strip_prefix("http://"), o.api_listen.as_str()) {
+        let api = match (
+            self.api.split_once("://").map(|(_, address)| address),
+            o.api_listen.as_str(),
+        ) {
             (Some(before), _) => before,
             (None, "") => "127.0.0.1:0",
             (None, wanted) => wanted,
@@ -245,7 +248,7 @@ impl HostProcess {
             quoted(&o.connect),
             o.cell_extra,
             o.tables.replace("{folder}", &folder),
-        )
+        ) + own_network(&o.listen)
     }
 
     /// Locators to connect to from the next start on.
@@ -290,7 +293,9 @@ impl HostProcess {
         self.folder.join("host.toml")
     }
 
-    fn stderr_path(&self) -> PathBuf {
+    /// Its error output: the log.
+    #[must_use]
+    pub fn stderr_path(&self) -> PathBuf {
         self.folder.join("stderr.log")
     }
 
@@ -425,5 +430,15 @@ impl Drop for HostProcess {
             eprintln!("--- the end of host {}'s error output", self.name);
             eprintln!("{}", self.stderr_tail());
         }
+    }
+}
+
+/// A host in a network of the test's own says so, or it would not start without TLS.
+fn own_network(listen: &[String]) -> &'static str {
+    let elsewhere = |place: &String| place.starts_with("tcp/") && !place.starts_with("tcp/127.");
+    if listen.iter().any(elsewhere) {
+        "\n[testing]\nopen_network = true\n"
+    } else {
+        ""
     }
 }

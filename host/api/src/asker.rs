@@ -1,32 +1,31 @@
-//! In whose name a request is worked on: the name that it gives (`x-by`) and the address that it comes from.
+//! The other end of a connection, and the name that a request gives of its asker (`x-by`).
 //!
-//! Never: believes a name. Without authentication it is what somebody says of himself, and the trail says so.
+//! Never: believes a name. It counts where the host asks nobody, and the trail says so; else the account's does (`guard`).
 
 use std::net::SocketAddr;
 
-use axum::{
-    extract::{ConnectInfo, Request, connect_info::Connected},
-    http::HeaderMap,
-    middleware::Next,
-    response::Response,
-    serve::IncomingStream,
-};
-use bumpless_deploy::audit::{Asker, Via};
+use axum::http::HeaderMap;
 
-use crate::{gate::Gate, limits::BY_CHARS_MAX};
+use crate::limits::BY_CHARS_MAX;
 
 /// The other end of a connection.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Peer(SocketAddr);
 
-impl Connected<IncomingStream<'_, Gate>> for Peer {
-    fn connect_info(stream: IncomingStream<'_, Gate>) -> Self {
-        Self(*stream.remote_addr())
+impl Peer {
+    /// Of this connection.
+    pub(crate) const fn new(address: SocketAddr) -> Self {
+        Self(address)
+    }
+
+    /// Its address.
+    pub(crate) const fn address(self) -> SocketAddr {
+        self.0
     }
 }
 
 /// The name in the header, without what does not belong on one line.
-fn by(headers: &HeaderMap) -> String {
+pub(crate) fn by(headers: &HeaderMap) -> String {
     let value = headers
         .get("x-by")
         .map(|value| String::from_utf8_lossy(value.as_bytes()));
@@ -37,19 +36,6 @@ fn by(headers: &HeaderMap) -> String {
         .collect::<String>()
         .trim()
         .to_owned()
-}
-
-/// Works on a request in the name of its asker.
-pub(crate) async fn named(request: Request, next: Next) -> Response {
-    let peer = request.extensions().get::<ConnectInfo<Peer>>();
-    let asker = Asker {
-        by: by(request.headers()),
-        via: Via::Api,
-        from: peer
-            .map(|ConnectInfo(Peer(address))| address.to_string())
-            .unwrap_or_default(),
-    };
-    asker.asks(next.run(request)).await
 }
 
 #[cfg(test)]

@@ -18,13 +18,13 @@ use bumpless_deploy::{
 };
 use tokio::sync::broadcast;
 
-use crate::{field::Field, program::Programs, signing::Signing, trail::Trail};
+use crate::{access::Access, field::Field, program::Programs, signing::Signing, trail::Trail};
 
 /// An answer that comes later. It owns what it needs, so that it can be finished after the asker has left.
 pub(crate) type Answer<T> = Pin<Box<dyn Future<Output = Result<T, Error>> + Send>>;
 
 /// One host's part in the cell; see [`Deploy`] for what each method means.
-pub(crate) trait Cell: Field + Programs + Signing + Trail {
+pub(crate) trait Cell: Access + Field + Programs + Signing + Trail {
     fn upload(&self, bytes: Vec<u8>, upload: Upload) -> Answer<ComponentInfo>;
     fn try_out(&self, bytes: Vec<u8>, upload: Upload) -> Answer<ComponentInfo>;
     fn relabel(&self, reference: String, change: Relabel) -> Answer<ComponentInfo>;

@@ -7,6 +7,8 @@
 //! | refused, in progress | 409 | the asker, once the cell has or does something else |
 //! | precondition | 412 | the asker, who counts on what has changed |
 //! | key reused | 422 | the asker, with a new key |
+//! | sign in, forbidden | 401, 403 | the asker, with a credential; an administrator |
+//! | too often | 429 | time |
 //! | busy, unreachable | 503 | time |
 //! | timeout | 504 | time; what was asked may still happen |
 //! | store, internal | 500 | the operator |
@@ -27,6 +29,14 @@ pub enum Error {
     /// The listener failed for good.
     #[error("the API's listener failed; is its address still this machine's?")]
     Listener(#[source] std::io::Error),
+    /// Certificate or key cannot be used.
+    #[error("{}: {reason}; give PEM files that belong together under [api.tls], `bumpless ca issue` makes some", path.display())]
+    Tls {
+        /// The file.
+        path: std::path::PathBuf,
+        /// What is wrong with it.
+        reason: String,
+    },
 }
 
 /// The content type of a problem.
@@ -46,6 +56,9 @@ pub(crate) enum Kind {
     TooLarge,
     ContentType,
     Invalid,
+    SignIn,
+    Forbidden,
+    TooOften,
     Internal,
     Store,
     Busy,
@@ -92,6 +105,9 @@ impl Kind {
                 "What was given cannot be right",
                 StatusCode::UNPROCESSABLE_ENTITY,
             ),
+            Self::SignIn => ("sign-in", "Nobody is known by this", StatusCode::UNAUTHORIZED),
+            Self::Forbidden => ("forbidden", "This may not be done", StatusCode::FORBIDDEN),
+            Self::TooOften => ("too-often", "Too many in a short time", StatusCode::TOO_MANY_REQUESTS),
             Self::Internal => ("internal", "The host failed", StatusCode::INTERNAL_SERVER_ERROR),
             Self::Store => ("store", "The host's disk failed", StatusCode::INTERNAL_SERVER_ERROR),
             Self::Busy => (
@@ -124,6 +140,9 @@ pub struct Problem {
     /// What helps, where it is known.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub cure: Option<String>,
+    /// Seconds to wait, for the header.
+    #[serde(skip)]
+    retry_after_s: Option<u64>,
 }
 
 impl Problem {
@@ -136,7 +155,14 @@ impl Problem {
             status: status.as_u16(),
             detail: detail.into(),
             cure: Some(cure.into()).filter(|cure| !cure.is_empty()),
+            retry_after_s: None,
         }
+    }
+
+    /// To be tried again after so many seconds.
+    pub(crate) const fn after_s(mut self, seconds: u64) -> Self {
+        self.retry_after_s = Some(seconds);
+        self
     }
 
     /// A body beyond the limit of its address, in bytes.
@@ -179,7 +205,11 @@ impl IntoResponse for Problem {
         // Five strings and a number always serialise; an empty body is still an honest status.
         let body = serde_json::to_vec(&self).unwrap_or_default();
         let mut response = (status, [(header::CONTENT_TYPE, PROBLEM_JSON)], body).into_response();
-        if status == StatusCode::SERVICE_UNAVAILABLE || self.kind.ends_with(":in-progress") {
+        if let Some(seconds) = self.retry_after_s {
+            response
+                .headers_mut()
+                .insert(header::RETRY_AFTER, HeaderValue::from(seconds));
+        } else if status == StatusCode::SERVICE_UNAVAILABLE || self.kind.ends_with(":in-progress") {
             response
                 .headers_mut()
                 .insert(header::RETRY_AFTER, HeaderValue::from_static("1"));

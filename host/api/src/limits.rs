@@ -10,6 +10,43 @@ pub const JSON_BYTES_MAX: usize = 256 * 1024;
 /// Connections that are open at once: each costs some 20 KiB and a file handle, of which a process often has 1,024.
 pub const CONNECTIONS_MAX: usize = 512;
 
+/// Connections of one address, so that one machine cannot take them all. A browser opens six, a proxy some dozens.
+pub const ADDRESS_CONNECTIONS_MAX: usize = 128;
+
+/// Longest time for the head of a request to arrive, and for a connection that is kept to be used again: a client that drips
+/// a byte now and then is no client.
+pub const HEAD_TIME_MAX: Duration = Duration::from_secs(20);
+
+/// Bytes of the head of a request: addresses and headers of ours have a few hundred.
+pub const HEAD_BYTES_MAX: usize = 32 * 1024;
+
+/// Longest time for a TLS handshake: a few round trips over a bad line.
+pub const HANDSHAKE_TIME_MAX: Duration = Duration::from_secs(10);
+
+/// Pause between two looks at the files of certificate and key.
+pub const TLS_LOOK_EVERY: Duration = Duration::from_secs(2);
+
+/// Bad credentials and sign-ins of one address at once, ...
+pub const ATTEMPTS_BURST: f64 = 20.0;
+
+/// ... and then each second: a guesser has 14,400 a day, of 2^256 tokens, or of passwords of 10 characters.
+pub const ATTEMPTS_PER_S: f64 = 1.0 / 6.0;
+
+/// Sign-ins with one name at once, from wherever, ...
+pub const NAME_ATTEMPTS_BURST: f64 = 30.0;
+
+/// ... and then each second. Faster than one address may, so that one address cannot lock somebody out.
+pub const NAME_ATTEMPTS_PER_S: f64 = 1.0 / 3.0;
+
+/// Requests with one credential at once, ...
+pub const PRINCIPAL_BURST: f64 = 400.0;
+
+/// ... and then each second: a page asks some ten times a second, a script a hundred.
+pub const PRINCIPAL_PER_S: f64 = 100.0;
+
+/// Pause between two looks at whether a live feed may go on.
+pub const RECHECK_EVERY: Duration = Duration::from_secs(1);
+
 /// Time without a byte either way after which a connection is closed. A feed writes every second, and a client that keeps a
 /// connection for later may open another.
 pub const IDLE_TIME_MAX: Duration = Duration::from_secs(180);

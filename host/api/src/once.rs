@@ -44,7 +44,7 @@ const REPLAYED: HeaderName = HeaderName::from_static("idempotency-replayed");
 /// Headers that are part of what an answer says.
 const KEPT_HEADERS: [HeaderName; 3] = [header::CONTENT_TYPE, header::LOCATION, header::ETAG];
 
-/// What makes two requests the same: SHA-256 of method, address and body.
+/// What makes two requests the same: SHA-256 of method, address, proved name and body.
 type Fingerprint = [u8; 32];
 
 /// An answer that is given again.
@@ -167,12 +167,14 @@ fn body_limit(method: &Method, path: &str) -> (usize, bool) {
     }
 }
 
-/// Method and address, with a mark after each so that they cannot run into each other.
+/// Method, address and proved name, with a mark after each so that they cannot run into each other.
 fn hasher(request: &Request) -> Sha256 {
     let uri = request.uri();
     let address = uri.path_and_query().map_or(uri.path(), |all| all.as_str());
     let mut hasher = Sha256::new();
-    for part in [request.method().as_str(), address] {
+    // A key of one person is none of another's.
+    let asker = Asker::signed(String::new());
+    for part in [request.method().as_str(), address, asker.as_str()] {
         hasher.update(part);
         hasher.update([0]);
     }

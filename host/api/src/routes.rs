@@ -2,6 +2,7 @@
 //!
 //! Never: decides; what may be done is the cell's to say.
 
+pub(crate) mod access;
 pub(crate) mod alarms;
 pub(crate) mod audit;
 pub(crate) mod bundle;
@@ -25,7 +26,7 @@ pub(crate) mod trend;
 
 use axum::{
     Router,
-    routing::{get, post},
+    routing::{delete, get, patch, post},
 };
 
 use crate::server::App;
@@ -33,6 +34,19 @@ use crate::server::App;
 /// Everything that takes a place and has a time limit.
 pub(crate) fn all() -> Router<App> {
     Router::new()
+        .route("/v1/access/me", get(access::me))
+        .route("/v1/access/first", post(access::first))
+        .route("/v1/access/sign-in", post(access::sign_in))
+        .route("/v1/access/sign-out", post(access::sign_out))
+        .route("/v1/access/password", post(access::password))
+        .route("/v1/access/users", get(access::users).post(access::add_user))
+        .route(
+            "/v1/access/users/{user}",
+            patch(access::change_user).delete(access::remove_user),
+        )
+        .route("/v1/access/users/{user}/tokens", post(access::make_token))
+        .route("/v1/access/tokens", get(access::tokens).post(access::make_own_token))
+        .route("/v1/access/tokens/{id}", delete(access::revoke_token))
         .route("/v1/components", get(components::list).post(components::upload))
         .route(
             "/v1/components/{reference}",

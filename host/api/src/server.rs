@@ -14,36 +14,46 @@ use std::{
 };
 
 use axum::{
-    Router,
-    extract::{MatchedPath, Request, State},
-    http::{HeaderValue, Method, header},
+    Extension, Router,
+    extract::{ConnectInfo, MatchedPath, Request, State},
+    http::{HeaderName, HeaderValue, Method, header},
     middleware::{self, Next},
     response::{IntoResponse as _, Response},
 };
 use bumpless_core::Digest;
 use bumpless_deploy::{Deploy, SPANS, audit::Asker};
 use futures_util::FutureExt as _;
+use hyper::server::conn::http1;
+use hyper_util::{
+    rt::{TokioIo, TokioTimer},
+    server::graceful::{GracefulShutdown, Watcher},
+    service::TowerToHyperService,
+};
 use tokio::{
+    io::{AsyncRead, AsyncWrite},
     net::TcpListener,
     sync::{Semaphore, mpsc, watch},
 };
+use tower::ServiceBuilder;
 use tracing::Instrument as _;
 
 use crate::{
-    asker::{self, Peer},
+    asker::Peer,
     cell::{Answer, Cell},
     door,
     error::{Error, Kind, Problem},
     gate::Gate,
+    guard::{self, Paces, Secure},
     happenings::Happenings,
     limits::{
-        BUNDLE_TIME_MAX, CALL_TIME_MAX, CHANGE_TIME_MAX, EXPORTS_MAX, FEEDS_MAX, PORT_TABLES_MAX, REQUEST_TIME_MAX,
-        REQUESTS_MAX, STOP_TIME_MAX, UPLOAD_TIME_MAX, UPLOADS_MAX,
+        BUNDLE_TIME_MAX, CALL_TIME_MAX, CHANGE_TIME_MAX, EXPORTS_MAX, FEEDS_MAX, HANDSHAKE_TIME_MAX, HEAD_BYTES_MAX,
+        HEAD_TIME_MAX, PORT_TABLES_MAX, REQUEST_TIME_MAX, REQUESTS_MAX, STOP_TIME_MAX, UPLOAD_TIME_MAX, UPLOADS_MAX,
     },
     metrics::Metrics,
     notices::Notices,
     once::{Keys, once},
     paging, routes,
+    tls::{Tls, TlsFiles},
     types::{Fault, PortTable, PortTables},
 };
 
@@ -61,6 +71,12 @@ pub struct Options {
     pub faults: Option<mpsc::Sender<Fault>>,
     /// What the host measures, where somebody else reads it too; else the server makes its own.
     pub metrics: Option<Arc<Metrics>>,
+    /// Certificate and key; none to serve plain HTTP, which is for loopback.
+    pub tls: Option<TlsFiles>,
+    /// May programs on the bus that are no hosts ask at doors?
+    pub doors: bool,
+    /// Names by which people reach the host besides its addresses and `localhost`.
+    pub names: Vec<String>,
 }
 
 impl Default for Options {
@@ -71,6 +87,9 @@ impl Default for Options {
             reports: None,
             faults: None,
             metrics: None,
+            tls: None,
+            doors: true,
+            names: Vec::new(),
         }
     }
 }
@@ -105,6 +124,12 @@ pub(crate) struct App {
     pub(crate) reports: Option<PathBuf>,
     /// Who does the faults of the demonstration.
     pub(crate) faults: Option<mpsc::Sender<Fault>>,
+    /// Who tried how often.
+    pub(crate) paces: Paces,
+    /// Names of the host.
+    pub(crate) names: Arc<[String]>,
+    /// Answers go over TLS.
+    secure: bool,
     requests: Arc<Semaphore>,
     ports: Arc<Mutex<PortTables>>,
 }
@@ -128,6 +153,9 @@ impl App {
             conditional: Arc::default(),
             reports: options.reports.clone(),
             faults: options.faults.clone(),
+            paces: Paces::default(),
+            names: options.names.clone().into(),
+            secure: options.tls.is_some(),
             stop,
             cell,
         }
@@ -170,14 +198,16 @@ pub(crate) async fn finish<T: Send + 'static>(answer: Answer<T>) -> Result<T, Pr
 /// Serves the API on `listener` until `shutdown` ends; then feeds end, and requests get [`STOP_TIME_MAX`] to finish.
 ///
 /// # Errors
-/// The listener failed for good.
+/// Certificate or key cannot be used.
 pub async fn serve(
     listener: TcpListener,
     deploy: Deploy,
     options: Options,
     shutdown: impl Future<Output = ()> + Send + 'static,
 ) -> Result<(), Error> {
-    door::open(&deploy);
+    if options.doors {
+        door::open(&deploy);
+    }
     serve_cell(listener, Arc::new(deploy), &options, shutdown).await
 }
 
@@ -187,28 +217,32 @@ pub(crate) async fn serve_cell(
     options: &Options,
     shutdown: impl Future<Output = ()> + Send + 'static,
 ) -> Result<(), Error> {
+    let tls = match options.tls.clone() {
+        Some(files) => Some(Tls::start(files).await?),
+        None => None,
+    };
+    if !cell.is_secured() {
+        tracing::warn!(
+            "this host asks nobody who he is: whoever reaches its API may operate the cell; [security] in its configuration asks"
+        );
+    }
     let (stopping, mut stop) = watch::channel(false);
     let app = App::new(Arc::clone(&cell), options, stop.clone());
     let follower = tokio::spawn(Arc::clone(&app.metrics).follow(cell, stop.clone()));
     let listener_of_notices = tokio::spawn(Notices::follow(app.clone()));
     let listener_of_alarms = tokio::spawn(Happenings::follow(app.clone()));
-    let graceful = async move {
+    let told = async move {
         shutdown.await;
         // Nobody listens only when nothing is served any more.
         let _ = stopping.send(true);
     };
-    let serving = async {
-        let service = router(app).into_make_service_with_connect_info::<Peer>();
-        axum::serve(Gate::new(listener), service)
-            .with_graceful_shutdown(graceful)
-            .await
-    };
+    let serving = connections(Gate::new(listener), tls, router(app), told);
     let overdue = async {
         let _ = stop.wait_for(|stop| *stop).await;
         tokio::time::sleep(STOP_TIME_MAX).await;
     };
     let end = tokio::select! {
-        end = serving => end.map_err(Error::Listener),
+        () = serving => Ok(()),
         () = overdue => {
             tracing::warn!("connections of the API were still open {} s after the stop", STOP_TIME_MAX.as_secs());
             Ok(())
@@ -218,6 +252,58 @@ pub(crate) async fn serve_cell(
     listener_of_notices.abort();
     listener_of_alarms.abort();
     end
+}
+
+/// Serves connections until it is told to stop; then those that are open get to finish.
+async fn connections(mut gate: Gate, tls: Option<Tls>, router: Router, told: impl Future<Output = ()>) {
+    let graceful = GracefulShutdown::new();
+    let mut told = std::pin::pin!(told);
+    loop {
+        let (place, peer) = tokio::select! {
+            next = gate.accept() => next,
+            () = &mut told => break,
+        };
+        let (router, watcher) = (router.clone(), graceful.watcher());
+        match &tls {
+            None => drop(tokio::spawn(connection(place, Peer::new(peer), false, router, watcher))),
+            Some(tls) => {
+                let acceptor = tls.acceptor();
+                // In a task of its own: a handshake that dawdles holds up nobody, and takes its place only for so long.
+                tokio::spawn(async move {
+                    match tokio::time::timeout(HANDSHAKE_TIME_MAX, acceptor.accept(place)).await {
+                        Ok(Ok(stream)) => connection(stream, Peer::new(peer), true, router, watcher).await,
+                        Ok(Err(error)) => tracing::debug!(%peer, %error, "no TLS"),
+                        Err(_) => tracing::debug!(%peer, "a TLS handshake that took too long"),
+                    }
+                });
+            }
+        }
+    }
+    // The listener goes first, so that nobody new comes.
+    drop(gate);
+    graceful.shutdown().await;
+}
+
+/// One connection, to its end.
+async fn connection(
+    stream: impl AsyncRead + AsyncWrite + Unpin + Send + 'static,
+    peer: Peer,
+    secure: bool,
+    router: Router,
+    watcher: Watcher,
+) {
+    let service = ServiceBuilder::new()
+        .layer(Extension(ConnectInfo(peer)))
+        .layer(Extension(Secure(secure)))
+        .service(router);
+    let served = http1::Builder::new()
+        .timer(TokioTimer::new())
+        .header_read_timeout(HEAD_TIME_MAX)
+        .max_header_size(HEAD_BYTES_MAX)
+        .serve_connection(TokioIo::new(stream), TowerToHyperService::new(service));
+    if let Err(error) = watcher.watch(served).await {
+        tracing::debug!(%error, "a connection ended early");
+    }
 }
 
 /// All routes behind their limits.
@@ -243,7 +329,7 @@ pub(crate) fn router(app: App) -> Router {
     // Health is asked for most when the host has no place left.
     limited
         .merge(routes::health())
-        .layer(middleware::from_fn(asker::named))
+        .layer(middleware::from_fn_with_state(app.clone(), guard::admit))
         .layer(middleware::from_fn_with_state(app.clone(), finish_answer))
         .with_state(app)
 }
@@ -319,11 +405,32 @@ async fn finish_answer(State(app): State<App>, request: Request, next: Next) -> 
     paging::link(&mut response, &asked);
     let headers = response.headers_mut();
     headers.insert(header::X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff"));
-    headers
-        .entry(header::CACHE_CONTROL)
-        .or_insert(HeaderValue::from_static("no-store"));
+    for (name, value) in HARDENED {
+        headers.entry(name).or_insert(HeaderValue::from_static(value));
+    }
+    if app.secure {
+        headers.insert(
+            header::STRICT_TRANSPORT_SECURITY,
+            HeaderValue::from_static("max-age=31536000"),
+        );
+    }
     response
 }
+
+/// What every answer says where its route says nothing else: not to be kept, shown in a frame, or taken for a page.
+const HARDENED: [(HeaderName, &str); 5] = [
+    (header::CACHE_CONTROL, "no-store"),
+    (
+        header::CONTENT_SECURITY_POLICY,
+        "default-src 'none'; frame-ancestors 'none'",
+    ),
+    (header::REFERRER_POLICY, "no-referrer"),
+    (HeaderName::from_static("cross-origin-resource-policy"), "same-origin"),
+    (
+        HeaderName::from_static("permissions-policy"),
+        "camera=(), geolocation=(), microphone=()",
+    ),
+];
 
 /// Routes that monitoring asks for every few seconds: their spans would only hide the others.
 const WATCHED: [&str; 4] = ["/livez", "/healthz", "/readyz", "/metrics"];

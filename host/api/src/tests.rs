@@ -3,11 +3,13 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "tests")]
 
+mod access;
 pub(crate) mod alarms;
 pub(crate) mod audit;
 mod candidates;
 pub(crate) mod fake;
 mod field;
+pub(crate) mod guests;
 mod history;
 mod hosts;
 mod lab;
@@ -100,10 +102,13 @@ pub(crate) async fn example_answer(method: &str, path: &str, request: Option<&Va
         ..Options::default()
     });
     let method = method.to_uppercase();
-    let request = match request {
+    let mut request = match request {
         Some(body) => send(&method, path, body),
         None => raw(&method, path, "application/json", ""),
     };
+    if path.starts_with("/v1/access/") {
+        access::in_session(&bench, &mut request);
+    }
     let (status, answer) = bench.json(request).await;
     (status.as_u16(), answer)
 }

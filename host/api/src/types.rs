@@ -5,6 +5,7 @@
 //! message bytes are base64, a number that is not finite is null.
 //! Never: decides or checks more than its own shape; the cell does.
 
+mod access;
 mod alarms;
 mod audit;
 mod call;
@@ -26,6 +27,10 @@ mod signing;
 mod words;
 
 pub use crate::routes::demo::{Demo, Fault, FaultKind};
+pub use access::{
+    AccessToken, AccessTokens, FirstRequest, Me, NewToken, NewUser, PasswordRequest, RoleWord, SignInRequest,
+    TokenRequest, User, UserChange, Users,
+};
 pub use alarms::{
     AlarmActRequest, AlarmActWord, AlarmDefinition, AlarmFlood, AlarmHappening, AlarmHistory, AlarmKind, AlarmShelf,
     AlarmState, LoopAlarm, LoopAlarms,

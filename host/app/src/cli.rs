@@ -7,6 +7,7 @@ use std::path::PathBuf;
 use clap::{CommandFactory as _, Parser, Subcommand, ValueEnum};
 use clap_complete::Shell;
 
+mod access;
 mod alarm;
 mod audit;
 mod author;
@@ -20,6 +21,7 @@ mod program;
 mod rollout;
 mod signing;
 
+pub(crate) use access::{CaCommand, LoginArgs, LoopsArgs, RoleArg, TokenCommand, UserCommand};
 pub(crate) use alarm::{AlarmCommand, Of as AlarmOf};
 pub(crate) use audit::{AuditCommand, Format as AuditFormat, ListArgs as AuditListArgs, Noted};
 pub(crate) use author::{BuildArgs, CheckArgs, DevArgs, LanguageWord, NewArgs};
@@ -32,7 +34,7 @@ pub(crate) use program::ProgramCommand;
 pub(crate) use rollout::{RolloutArgs, RolloutCommand};
 pub(crate) use signing::{KeysCommand, PassphraseArgs, PolicyWord, RoleWord, RootArgs, SignArgs, VerifyArgs};
 
-use crate::{client::Client, commands, demo, error::Error, host, watch};
+use crate::{client::Client, commands, demo, error::Error, host, proof::Proof, watch};
 
 /// Where the API is expected.
 const API_DEFAULT: &str = "http://127.0.0.1:8480";
@@ -67,6 +69,12 @@ pub(crate) struct To {
     /// Print the API's JSON instead of text for people.
     #[arg(long, global = true)]
     pub(crate) json: bool,
+    /// A file with a token that only you may read (0600). BUMPLESS_TOKEN may hold the token itself; an argument never does.
+    #[arg(long, global = true, env = "BUMPLESS_TOKEN_FILE", value_name = "FILE")]
+    pub(crate) token_file: Option<PathBuf>,
+    /// The authority that signed the host's certificate (PEM); the public ones where not given.
+    #[arg(long, global = true, env = "BUMPLESS_CA", value_name = "FILE")]
+    pub(crate) ca: Option<PathBuf>,
 }
 
 /// What can be done.
@@ -150,6 +158,25 @@ pub(crate) enum Command {
     Points,
     /// Follow a loop: trend, who stepped, control indices.
     Watch(WatchArgs),
+    /// Accounts: list, make the first one, add, change, remove.
+    User {
+        #[command(subcommand)]
+        what: UserCommand,
+    },
+    /// Tokens for programs: list, make, revoke.
+    Token {
+        #[command(subcommand)]
+        what: TokenCommand,
+    },
+    /// Sign in for the command line: a token of your own, in a file.
+    Login(LoginArgs),
+    /// Who you are to the host, and what you may do.
+    Whoami,
+    /// Certificates for a cell: an authority of its own, and its hosts.
+    Ca {
+        #[command(subcommand)]
+        what: CaCommand,
+    },
     /// Print a completion script for a shell.
     Completions {
         /// Which shell.
@@ -399,8 +426,9 @@ fn number_pair(text: &str) -> Result<(String, f64), String> {
 /// # Errors
 /// What failed; its exit code says of which sort.
 pub fn run(cli: Cli) -> Result<(), Error> {
-    let client = || Client::new(&cli.to.api);
-    let json = cli.to.json;
+    let to = &cli.to;
+    let client = || Client::with(&to.api, Proof::of(to)?);
+    let json = to.json;
     match cli.command {
         Command::Host(args) => host::run(&args),
         Command::Demo(args) => demo::run(&args),
@@ -433,6 +461,11 @@ pub fn run(cli: Cli) -> Result<(), Error> {
         Command::Restore(args) => commands::backup::restore(client, json, &args),
         Command::Points => commands::hosts::points(&client()?, json),
         Command::Watch(args) => watch::run(&client()?, json, &args),
+        Command::User { what } => commands::access::users(&client()?, to, what),
+        Command::Token { what } => commands::access::tokens(&client()?, to, what),
+        Command::Login(args) => commands::access::login(&client()?, to, args),
+        Command::Whoami => commands::access::whoami(&client()?, to),
+        Command::Ca { what } => commands::ca::run(what),
         Command::Completions { shell } => {
             clap_complete::generate(shell, &mut Cli::command(), "bumpless", &mut std::io::stdout());
             Ok(())
@@ -562,6 +595,15 @@ mod tests {
             "bumpless hosts drain a --keep",
             "bumpless hosts undrain a --wait 30",
             "bumpless demo --for 5 --restart",
+            "bumpless user first ann --first-token data/first-token -o token",
+            "bumpless user add bob --role operator --loop tank-* --loop pressure --note shift_2",
+            "bumpless user set bob --disabled true",
+            "bumpless token new bob --days 30 -o bob.token --role viewer",
+            "bumpless token revoke 0123456789abcdef",
+            "bumpless login ann --token-file t --ca ca.pem",
+            "bumpless whoami",
+            "bumpless ca init --cell mill --dir keys",
+            "bumpless ca issue plant --cell mill --address 10.0.0.5 --address plant.example",
             "bumpless completions bash",
             "bumpless compile-child in out",
         ] {
@@ -599,6 +641,12 @@ mod tests {
             ("bumpless io force oven.pv 80 --for 25h --why test", "1s to 24h"),
             ("bumpless io scan", "<ADDRESS>"),
             ("bumpless io scan h:502 --units 9-1", "lies behind the last"),
+            (
+                "bumpless user add bob --role boss",
+                "[possible values: viewer, operator, engineer, admin]",
+            ),
+            ("bumpless user add bob --role viewer --password x", "--no-password"),
+            ("bumpless ca issue a --cell m --days 0", "1..=3650"),
             ("bumpless lop", "'loop'"),
         ] {
             let error = parse(bad).expect_err(bad);

@@ -2,16 +2,23 @@
 //!
 //! Never: repeats a request by itself; only the asker knows whether twice is right.
 
-use std::{io::Read, time::Duration};
+use std::{
+    io::Read,
+    net::{IpAddr, ToSocketAddrs as _},
+    sync::Arc,
+    time::Duration,
+};
 
-use bumpless_api::Problem;
+use bumpless_api::{Problem, types::Me};
 use serde::{Serialize, de::DeserializeOwned};
 use ureq::{
     Agent, Body, SendBody,
-    http::{Response, StatusCode},
+    http::{HeaderValue, Request, Response, StatusCode, header},
+    middleware::MiddlewareNext,
+    tls::{RootCerts, TlsConfig},
 };
 
-use crate::error::Error;
+use crate::{error::Error, proof::Proof};
 
 /// Longest wait for a connection: a host that does not take one in this time is not there.
 const CONNECT_TIME_MAX: Duration = Duration::from_secs(3);
@@ -33,6 +40,8 @@ pub(crate) struct Client {
     base: String,
     /// Who asks, for the audit trail.
     by: String,
+    /// What is shown to hosts.
+    proof: Proof,
 }
 
 /// The text of a good answer.
@@ -52,14 +61,48 @@ impl Answer {
 }
 
 impl Client {
-    /// For the API at `api`, such as `http://127.0.0.1:8480`.
+    /// For the API at `api`, such as `http://127.0.0.1:8480`, without a credential.
     pub(crate) fn new(api: &str) -> Result<Self, Error> {
+        Self::with(api, Proof::default())
+    }
+
+    /// For the API at `api`, with what is shown to it.
+    pub(crate) fn with(api: &str, proof: Proof) -> Result<Self, Error> {
+        Self::sending(api, proof, Vec::new())
+    }
+
+    /// The same for another host of the cell.
+    pub(crate) fn at(&self, api: &str) -> Result<Self, Error> {
+        Self::with(api, self.proof.clone())
+    }
+
+    /// With headers that go with every request.
+    fn sending(api: &str, proof: Proof, more: Vec<(header::HeaderName, HeaderValue)>) -> Result<Self, Error> {
         let base = api.trim_end_matches('/').to_owned();
-        if !base.starts_with("http://") {
+        let plain = base.strip_prefix("http://");
+        if plain.is_none() && !base.starts_with("https://") {
             return Err(Error::Usage(format!(
-                "{api:?} is no address of an API: write it as http://HOST:PORT (TLS ends at a proxy in front of it)"
+                "{api:?} is no address of an API: write it as http://HOST:PORT or https://HOST:PORT"
             )));
         }
+        let mut headers = more;
+        headers.extend(proof.bearer.clone().map(|bearer| (header::AUTHORIZATION, bearer)));
+        if !headers.is_empty() && plain.is_some_and(|authority| !stays_here(authority)) {
+            return Err(Error::Usage(format!(
+                "{api} has no TLS, and everybody on the way would read the token; write it as https://HOST:PORT"
+            )));
+        }
+        let headers = Arc::new(headers);
+        let with_headers = move |mut request: Request<SendBody>, next: MiddlewareNext| {
+            for (name, value) in headers.iter() {
+                request.headers_mut().insert(name, value.clone());
+            }
+            next.handle(request)
+        };
+        let roots = proof
+            .roots
+            .as_ref()
+            .map_or(RootCerts::WebPki, |roots| RootCerts::new_with_certs(roots));
         let config = Agent::config_builder()
             .http_status_as_error(false)
             .timeout_connect(Some(CONNECT_TIME_MAX))
@@ -67,13 +110,47 @@ impl Client {
             // The API is meant as it was typed; proxies are for the world outside.
             .proxy(None)
             .max_redirects(0)
+            .tls_config(TlsConfig::builder().root_certs(roots).build())
+            .middleware(with_headers)
             .user_agent(concat!("bumpless/", env!("CARGO_PKG_VERSION")))
             .build();
         Ok(Self {
             agent: config.into(),
             base,
             by: who(),
+            proof,
         })
+    }
+
+    /// Signs in: who one is then, and a client that is in the session.
+    pub(crate) fn session(&self, path: &str, body: &impl Serialize) -> Result<(Me, Self), Error> {
+        let response = self.good(self.agent.post(self.url(path)).header("x-by", &self.by).send_json(body))?;
+        let odd = |reason: &str| Error::Answer {
+            api: self.base.clone(),
+            reason: reason.to_owned(),
+        };
+        let cookie = response
+            .headers()
+            .get(header::SET_COOKIE)
+            .and_then(|value| value.to_str().ok());
+        let cookie = cookie
+            .and_then(|text| text.split(';').next())
+            .ok_or_else(|| odd("it sets no cookie"))?;
+        let mut cookie = HeaderValue::try_from(cookie).map_err(|_| odd("its cookie"))?;
+        cookie.set_sensitive(true);
+        let me: Me = self.answer(Ok(response))?.decode()?;
+        let csrf = me.csrf.as_deref().ok_or_else(|| odd("it has no second secret"))?;
+        let csrf = HeaderValue::try_from(csrf).map_err(|_| odd("its second secret"))?;
+        // In the session, and in no other's name.
+        let proof = Proof {
+            bearer: None,
+            ..self.proof.clone()
+        };
+        let headers = vec![
+            (header::COOKIE, cookie),
+            (header::HeaderName::from_static("x-csrf-token"), csrf),
+        ];
+        Ok((me, Self::sending(&self.base, proof, headers)?))
     }
 
     fn url(&self, path: &str) -> String {
@@ -233,6 +310,23 @@ impl Client {
     }
 }
 
+/// Does this authority mean this machine?
+fn stays_here(authority: &str) -> bool {
+    let host = match authority.strip_prefix('[').and_then(|rest| rest.split_once(']')) {
+        Some((host, _)) => host,
+        None => authority.rsplit_once(':').map_or(authority, |(host, _)| host),
+    };
+    match host.parse::<IpAddr>() {
+        Ok(address) => address.to_canonical().is_loopback(),
+        Err(_) => {
+            let found = (host, 80)
+                .to_socket_addrs()
+                .map(|all| all.map(|a| a.ip()).collect::<Vec<_>>());
+            found.is_ok_and(|all| !all.is_empty() && all.iter().all(IpAddr::is_loopback))
+        }
+    }
+}
+
 /// The name that goes with each request: `BUMPLESS_BY`, else the user's. What is no letter of ASCII is left out, for it would be
 /// read in different ways.
 fn who() -> String {
@@ -271,6 +365,24 @@ mod tests {
     fn addresses_are_checked() {
         let error = Client::new("127.0.0.1:8480").expect_err("no scheme");
         assert!(error.to_string().contains("http://HOST:PORT"), "{error}");
+        let proof = || Proof {
+            bearer: crate::proof::bearer("bpl_1").ok(),
+            roots: None,
+        };
+        let error = Client::with("http://192.0.2.1:8480", proof()).expect_err("in the clear");
+        assert!(error.to_string().contains("https://HOST:PORT"), "{error}");
+        for good in [
+            "https://192.0.2.1:8480",
+            "http://127.0.0.1:1",
+            "http://[::1]:1",
+            "http://localhost:1",
+        ] {
+            assert!(Client::with(good, proof()).is_ok(), "{good}");
+        }
+        assert!(
+            Client::new("http://192.0.2.1:8480").is_ok(),
+            "without a token there is nothing to read"
+        );
         assert_eq!(
             Client::new("http://127.0.0.1:8480/").expect("good").api(),
             "http://127.0.0.1:8480"

@@ -2,10 +2,12 @@
 //!
 //! Never: decide; what the cell refuses is an error with the cell's own words.
 
+pub(crate) mod access;
 pub(crate) mod alarms;
 pub(crate) mod audit;
 pub(crate) mod author;
 pub(crate) mod backup;
+pub(crate) mod ca;
 pub(crate) mod components;
 pub(crate) mod curves;
 pub(crate) mod history;

@@ -39,6 +39,8 @@ const API_STOP_TIMEOUT: Duration = Duration::from_secs(10);
 pub struct Running {
     /// Where the API listens.
     pub api: SocketAddr,
+    /// Does it have TLS?
+    pub api_tls: bool,
     /// Where other hosts reach this one.
     pub locators: Vec<String>,
     /// What the host measures.
@@ -150,6 +152,12 @@ pub async fn run(config: Config, faults: Option<mpsc::Sender<Fault>>) -> Result<
     } else {
         None
     };
+    if let Some(files) = config.api_tls.clone() {
+        // What cannot be used is better said before anything listens.
+        blocking(move || files.read().map(drop))
+            .await?
+            .map_err(|e| Error::start("the API's TLS", e))?;
+    }
     let listener = TcpListener::bind(config.api_listen).await.map_err(|source| {
         let place = format!(
             "the API on {}: choose another address with [api] listen",
@@ -214,7 +222,11 @@ pub async fn run(config: Config, faults: Option<mpsc::Sender<Fault>>) -> Result<
             io: config.io,
             control: config.control,
         },
-        api: Some(format!("http://{api}")),
+        api: Some(format!(
+            "{}://{api}",
+            if config.api_tls.is_some() { "https" } else { "http" }
+        )),
+        secured: config.secured,
         labels: config.labels.clone(),
         version: env!("CARGO_PKG_VERSION").to_owned(),
         audit_bytes_max: config.audit_bytes_max,
@@ -241,10 +253,14 @@ pub async fn run(config: Config, faults: Option<mpsc::Sender<Fault>>) -> Result<
     let metrics = bumpless_api::Metrics::of(&deploy);
     options.metrics = Some(Arc::clone(&metrics));
     options.reports.clone_from(&config.lab_reports);
+    options.tls.clone_from(&config.api_tls);
+    options.names.clone_from(&config.api_names);
+    options.doors = config.doors;
     let serving = bumpless_api::serve(listener, deploy.clone(), options, stopped);
     let api_task = tokio::spawn(serving);
     Ok(Running {
         api,
+        api_tls: config.api_tls.is_some(),
         locators,
         metrics,
         deploy,

@@ -12,7 +12,21 @@
 //! connect = []                     # one that is up is enough
 //!
 //! [api]
-//! listen = "127.0.0.1:8480"
+//! listen = "127.0.0.1:8480"         # elsewhere only with [security] and [api.tls]
+//! names = []                       # names by which people reach it besides addresses, such as "plant.example"
+//!
+//! [api.tls]                        # PEM files, read again when they change; `bumpless ca` makes some
+//! certificate = "plant.pem"
+//! key = "plant.key"
+//!
+//! [cell.tls]                       # every link with TLS on both sides, between these hosts alone
+//! ca = "ca.pem"
+//! certificate = "plant.pem"
+//! key = "plant.key"
+//! members = ["plant", "a", "b"]
+//!
+//! [security]                       # everybody has an account or a token; without this table nobody is asked
+//! doors = false                    # may programs on the bus that are no hosts start jobs?
 //!
 //! [history]                        # of the loops at home or held here
 //! enabled = true
@@ -81,12 +95,14 @@ use serde::{Deserialize, Serialize};
 mod history;
 mod itself;
 mod lab;
+mod security;
 mod testing;
 mod trust;
 
 use crate::{error::Error, realtime::Realtime};
 use history::HistoryTable;
 use lab::LabTable;
+use security::{ApiTls, CellTls, Openness, SecurityTable};
 use testing::TestingTable;
 use trust::TrustTable;
 
@@ -112,6 +128,14 @@ pub struct Config {
     pub cell: bumpless_cell::Config,
     /// Where the API listens.
     pub api_listen: SocketAddr,
+    /// Names by which people reach the API besides addresses.
+    pub api_names: Vec<String>,
+    /// Certificate and key of the API; none on loopback, where plain HTTP will do.
+    pub api_tls: Option<bumpless_api::TlsFiles>,
+    /// Must everybody who asks the API say who he is?
+    pub secured: bool,
+    /// May programs on the bus that are no hosts start jobs?
+    pub doors: bool,
     /// Does it serve points? There are buses, then.
     pub io: bool,
     /// Does it run controllers?
@@ -163,6 +187,8 @@ pub(crate) struct File {
     cell: CellTable,
     #[serde(default)]
     api: ApiTable,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    security: Option<SecurityTable>,
     #[serde(default)]
     roles: RolesTable,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
@@ -208,19 +234,27 @@ struct CellTable {
     scouting: bool,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     lease_ms: Option<u64>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    tls: Option<CellTls>,
 }
 
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 struct ApiTable {
     listen: SocketAddr,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    names: Vec<String>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    tls: Option<ApiTls>,
 }
 
 impl Default for ApiTable {
     fn default() -> Self {
-        // Loopback: whoever reaches the API may operate the cell.
+        // Loopback: without [security] whoever reaches the API may operate the cell.
         Self {
             listen: SocketAddr::from((Ipv4Addr::LOCALHOST, 8480)),
+            names: Vec::new(),
+            tls: None,
         }
     }
 }
@@ -344,6 +378,10 @@ impl File {
         let mut cell = bumpless_cell::Config::new(self.cell.name, self.host.clone());
         cell.connect = self.cell.connect;
         cell.scouting = self.cell.scouting;
+        if let Some(tls) = self.cell.tls {
+            cell.tls = Some(tls.config(folder));
+            cell.listen = vec!["tls/127.0.0.1:0".to_owned()];
+        }
         if let Some(listen) = self.cell.listen {
             cell.listen = listen;
         }
@@ -351,6 +389,17 @@ impl File {
             cell.lease_ms = lease_ms;
         }
         cell.check().map_err(|error| wrong("cell", error.to_string()))?;
+        let asks = self.security;
+        let open = Openness {
+            api: self.api.listen,
+            names: &self.api.names,
+            users: asks.is_some_and(|table| table.users),
+            api_tls: self.api.tls.is_some(),
+            cell: &cell,
+            testing: self.testing.open_network,
+        };
+        security::check(&open, &wrong)?;
+        let secured = open.users;
 
         itself::check(&self.labels, self.clock_offset_s, &wrong)?;
         if let Some(otlp) = &self.otlp {
@@ -408,6 +457,10 @@ impl File {
             realtime: self.realtime,
             cell,
             api_listen: self.api.listen,
+            api_tls: self.api.tls.map(|tls| tls.files(folder)),
+            api_names: self.api.names,
+            secured,
+            doors: asks.is_none_or(|table| table.doors),
             io,
             control,
             buses,

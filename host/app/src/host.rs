@@ -84,6 +84,9 @@ async fn live(config: Config, mut telemetry: Option<Telemetry>, args: &HostArgs)
     // Before anything is started, so that no signal is missed.
     let mut terminate = signal(SignalKind::terminate()).map_err(|error| Error::start("the signal handler", error))?;
     let mut interrupt = signal(SignalKind::interrupt()).map_err(|error| Error::start("the signal handler", error))?;
+    // Supervisors send it so that files are read again. Certificates are looked at every two seconds, so there is nothing to do;
+    // without a handler it would end the host.
+    let _hangup = signal(SignalKind::hangup()).map_err(|error| Error::start("the signal handler", error))?;
     let parent_gone = parent_gone(args.until_stdin_closes)?;
 
     let (host, wish) = (config.host.clone(), config.realtime);
@@ -98,7 +101,7 @@ async fn live(config: Config, mut telemetry: Option<Telemetry>, args: &HostArgs)
     let ready = Ready {
         ready: true,
         host: host.to_string(),
-        api: format!("http://{}", running.api),
+        api: format!("{}://{}", if running.api_tls { "https" } else { "http" }, running.api),
         cell: running.locators.clone(),
     };
     show::line(&serde_json::to_string(&ready).map_err(|error| Error::start("the line that says ready", error))?)?;

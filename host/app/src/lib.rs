@@ -19,6 +19,7 @@ mod dry_run;
 mod error;
 mod host;
 mod log;
+mod proof;
 mod show;
 mod stop;
 mod systemd;

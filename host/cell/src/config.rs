@@ -8,6 +8,7 @@ use zenoh::config::EndPoint;
 
 use crate::{
     error::{Error, cut},
+    guarded::TlsConfig,
     limits::{
         CYCLE_BATCHES, ENDPOINTS_MAX, LEASE_MS_MAX, LEASE_MS_MIN, RECEIVE_BUFFER_BYTES, REPLY_WAIT_US_MAX,
         REQUEST_BYTES_MAX, SEND_BUFFER_BYTES,
@@ -40,6 +41,9 @@ pub struct Config {
     /// closed connections, in milliseconds; the lease is for one that freezes or a cable that is pulled.
     #[serde(default = "lease_ms_default")]
     pub lease_ms: u64,
+    /// TLS on both sides of every link; none for links that stay on this machine.
+    #[serde(default)]
+    pub tls: Option<TlsConfig>,
 }
 
 /// Loopback only: a host is not open to a network until someone says which.
@@ -65,6 +69,7 @@ impl Config {
             connect: Vec::new(),
             scouting: false,
             lease_ms: lease_ms_default(),
+            tls: None,
         }
     }
 
@@ -95,9 +100,11 @@ impl Config {
                     reason: format!("at most {ENDPOINTS_MAX} are allowed"),
                 });
             }
-            endpoints.iter().try_for_each(|text| check_endpoint(field, text))?;
+            endpoints
+                .iter()
+                .try_for_each(|text| check_endpoint(field, text, self.tls.is_some()))?;
         }
-        Ok(())
+        self.tls.as_ref().map_or(Ok(()), |tls| tls.check(&self.host))
     }
 
     /// The configuration of the Zenoh session.
@@ -154,8 +161,9 @@ impl Config {
                 (REQUEST_BYTES_MAX + 64 * 1024).to_string(),
             ),
         ];
+        let guarded = self.tls.as_ref().map(|tls| tls.settings(&self.cell));
         let mut config = zenoh::Config::default();
-        for (key, value) in settings {
+        for (key, value) in settings.into_iter().chain(guarded.into_iter().flatten()) {
             config.insert_json5(key, &value).map_err(|error| Error::Config {
                 field: key,
                 value,
@@ -166,7 +174,7 @@ impl Config {
     }
 }
 
-fn check_endpoint(field: &'static str, text: &str) -> Result<(), Error> {
+fn check_endpoint(field: &'static str, text: &str, tls: bool) -> Result<(), Error> {
     let bad = |reason: String| Error::Config {
         field,
         value: format!("{:?}", cut(text, 200)),
@@ -176,9 +184,14 @@ fn check_endpoint(field: &'static str, text: &str) -> Result<(), Error> {
         .parse()
         .map_err(|error| bad(format!("it is no endpoint such as \"tcp/10.0.0.5:7447\" ({error})")))?;
     match endpoint.protocol().as_str() {
-        "tcp" | "unixsock-stream" => Ok(()),
+        "tcp" | "unixsock-stream" if !tls => Ok(()),
+        "tls" if tls => Ok(()),
+        "tcp" | "unixsock-stream" => Err(bad(
+            "with [cell.tls] every link has it; write tls/ADDRESS:PORT".to_owned()
+        )),
+        "tls" => Err(bad("it needs certificates, under [cell.tls]".to_owned())),
         other => Err(bad(format!(
-            "the protocol {other:?} is not built in; use tcp or unixsock-stream"
+            "the protocol {other:?} is not built in; use tcp, unixsock-stream or tls"
         ))),
     }
 }
@@ -216,6 +229,34 @@ mod tests {
     }
 
     #[test]
+    fn with_tls_zenoh_is_told_who_is_who_and_lets_nobody_else_in() {
+        let mut config = config();
+        config.tls = Some(TlsConfig {
+            ca: "/x/ca.pem".into(),
+            certificate: "/x/plant.pem".into(),
+            key: "/x/plant.key".into(),
+            members: vec![HostId::new("plant").unwrap(), HostId::new("a").unwrap()],
+        });
+        assert!(config.check().unwrap_err().to_string().contains("write tls/"));
+        config.listen = vec!["tls/127.0.0.1:0".to_owned()];
+        let told = config.zenoh().expect("a good configuration");
+        assert_eq!(told.get_json("transport/link/protocols").unwrap(), r#"["tls"]"#);
+        let tls: serde_json::Value = serde_json::from_str(&told.get_json("transport/link/tls").unwrap()).unwrap();
+        assert_eq!(
+            (&tls["enable_mtls"], &tls["verify_name_on_connect"]),
+            (&true.into(), &true.into())
+        );
+        let rules: serde_json::Value = serde_json::from_str(&told.get_json("access_control").unwrap()).unwrap();
+        assert_eq!(
+            (&rules["enabled"], &rules["default_permission"]),
+            (&true.into(), &"deny".into())
+        );
+        assert_eq!(rules["subjects"].as_array().unwrap().len(), 2);
+        config.tls = None;
+        assert!(config.check().unwrap_err().to_string().contains("under [cell.tls]"));
+    }
+
+    #[test]
     fn bad_fields_are_named_with_their_cure() {
         type Change = fn(&mut Config);
         let table: [(Change, &str, &str); 6] = [
@@ -233,7 +274,7 @@ mod tests {
             (
                 |c| c.connect = vec!["quic/10.0.0.5:7447".into()],
                 "connect",
-                "use tcp or unixsock-stream",
+                "use tcp, unixsock-stream or tls",
             ),
             (|c| c.connect = vec!["tcp/a:1".into(); 65], "connect", "at most 64"),
             (|c| c.listen.clear(), "listen", "alone for ever"),

@@ -78,3 +78,6 @@ pub const DOOR_BYTES_MAX: usize = 256 * 1024;
 
 /// Questions at one door that are answered at a time; a further one is turned away.
 pub const DOOR_ASKED_MAX: usize = 64;
+
+/// Members of a cell with TLS: each has five rules of its own, which every message of a new key is looked up in once.
+pub const MEMBERS_MAX: usize = 200;

@@ -80,6 +80,7 @@ impl Room {
                 Ask::Audit(ask) => self.audit_here(ask).await,
                 Ask::History(ask) => self.history_here(*ask).await.map(Box::new).map(Told::History),
                 Ask::Program(ask) => self.programs_here(&from, *ask).await.map(Box::new).map(Told::Program),
+                Ask::Access => Ok(Told::Access(Box::new((*self.keyring.register()).clone()))),
                 Ask::Rollout(ask) => self.rollout_here(ask).await,
                 Ask::Field(ask) => self.field_here(*ask).await.map(Box::new).map(Told::Field),
                 Ask::Records(ids) => {

@@ -18,6 +18,7 @@ use crate::{
     wire::{Ask, Told},
 };
 
+mod access;
 mod alarms;
 mod audit;
 mod changes;
@@ -27,6 +28,8 @@ mod points;
 mod programs;
 mod rollouts;
 mod signing;
+
+pub use access::{AccountDraft, SignedIn};
 
 /// One host's part in the cell. Clones share it. It lives until [`Deploy::shutdown`].
 #[derive(Clone)]

@@ -18,10 +18,11 @@
 //! `book`, `library`, `roster`, `feed` (what it keeps); `admission`, `bench`, `holder`, `home`, `preference`, `drain`, `expect`,
 //! `change`, `orders`, `health` (what it does);
 //! `trials` with `rehearsal`, `verdict`, `replay`, `shadows`, `curve`, `report` (looking back, and trying candidates);
-//! `rollout` (one component for many loops, by rule); `history` (what was, for years); `audit` (who changed what);
+//! `rollout` (one component for many loops, by rule); `history` (what was, for years); `audit` (who changed what); `access` (who may);
 //! `webhook`, `self_watch`; `programs` (free-running ones);
 //! `sync`, `answers`, `service`, `room`, `deploy` (how it hangs together).
 
+mod access;
 mod admission;
 pub mod alarms;
 mod answers;
@@ -80,7 +81,7 @@ pub const SPANS: &str = "bumpless::spans";
 pub use admission::examined;
 pub use bumpless_cell::Knock;
 pub use bumpless_store::Window;
-pub use deploy::Deploy;
+pub use deploy::{AccountDraft, Deploy, SignedIn};
 pub use draft::{Change, LoopDraft};
 pub use error::{Error, Words};
 pub use expect::Expect;

@@ -310,6 +310,9 @@ pub const AUDIT_FAILURES_MAX: u32 = 100;
 /// See [`AUDIT_FAILURES_MAX`].
 pub const AUDIT_FAILURES_WINDOW: Duration = Duration::from_secs(10);
 
+/// Passwords that are hashed at once: each takes 19 MiB and a core for some tens of ms.
+pub const HASHES_AT_ONCE: usize = 2;
+
 /// Entries of one list: some 500 KB.
 pub const AUDIT_LIST_MAX: u32 = 1_000;
 

@@ -32,6 +32,7 @@ use tokio::{
 };
 
 use crate::{
+    access::Keyring,
     alarms::Alarms,
     audit::Audit,
     bench::Bench,
@@ -96,6 +97,8 @@ pub struct Parts {
     pub host_alarms: HostAlarms,
     /// Root keys of which one must sign the first document of trust; any may, where none is named.
     pub trust_roots: Vec<PublicKey>,
+    /// Must everybody who asks the API say who he is?
+    pub secured: bool,
 }
 
 /// What reaches deployment.
@@ -174,6 +177,7 @@ pub(crate) struct Room {
     pub(crate) alarms: Alarms,
     pub(crate) terms: Terms,
     pub(crate) audit: Audit,
+    pub(crate) keyring: Keyring,
     pub(crate) webhooks: Webhooks,
     pub(crate) self_watch: SelfWatch,
     pub(crate) commissioning: Commissioning,
@@ -231,6 +235,7 @@ impl Room {
             webhooks,
             host_alarms,
             trust_roots,
+            secured,
         } = parts;
         // A host that was to stay empty over its restart says so from its first word on.
         let drain_kept = store.host_value::<bool>(drain::KEPT)?.unwrap_or(false);
@@ -279,6 +284,7 @@ impl Room {
             programs,
             alarms: Alarms::default(),
             audit,
+            keyring: Keyring::open(store.clone(), secured)?,
             webhooks,
             self_watch: SelfWatch::new(host_alarms),
             commissioning: Commissioning::new(&store, clock)?,

@@ -1,4 +1,4 @@
-//! Keeps the copies of library and intents alike on all hosts.
+//! Keeps the copies of library, intents and accounts alike on all hosts.
 //!
 //! A notice says what changed, and is worked on at once. What got lost is found by comparing marks every second: where
 //! they differ, the lists are compared, and what is missing is fetched. Nothing depends on a notice arriving.
@@ -59,7 +59,7 @@ impl Room {
         match notice {
             Notice::Standing { library, intents } => {
                 let marks = (*library, *intents);
-                let ours = (self.library_mark(), self.book.mark());
+                let ours = (self.library_mark(), self.intents_mark());
                 let mut comparing = self.comparing.lock();
                 if marks == ours {
                     comparing.done.remove(from);
@@ -83,7 +83,7 @@ impl Room {
         match notice {
             Notice::Standing { library, intents } => {
                 let compared = self.compare(from).await;
-                let ours = (self.library_mark(), self.book.mark());
+                let ours = (self.library_mark(), self.intents_mark());
                 let mut comparing = self.comparing.lock();
                 comparing.now.remove(from);
                 if compared.is_ok() {
@@ -142,7 +142,7 @@ impl Room {
             Ok(_) => end = end.and(Err(Error::internal("the answer is no list of intents"))),
             Err(error) => end = end.and(Err(error)),
         }
-        end
+        end.and(self.copy_access(from).await)
     }
 
     async fn copy_component(self: &Arc<Self>, from: &HostId, digest: Digest) -> Result<(), Error> {

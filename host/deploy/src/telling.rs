@@ -62,7 +62,7 @@ impl Room {
         self.told.lock().standing = Some(Instant::now());
         self.announce(&Notice::Standing {
             library: self.library_mark(),
-            intents: self.book.mark(),
+            intents: self.intents_mark(),
         });
     }
 

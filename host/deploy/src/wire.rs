@@ -6,6 +6,7 @@
 
 use std::collections::BTreeMap;
 
+use bumpless_access::Register;
 use bumpless_core::{
     Command, ComponentInfo, Digest, Edition, HostId, Intent, LoopId, LoopSpec, Message, PointId, Reading, Record,
     alarms::Flood,
@@ -113,6 +114,8 @@ pub(crate) enum Ask {
     Program(Box<ProgramAsk>),
     /// What the host trusts: the document, and signatures.
     Trust,
+    /// Who may do what.
+    Access,
 }
 
 /// What may be asked about alarms.
@@ -259,6 +262,8 @@ pub(crate) enum Told {
     Program(Box<ProgramTold>),
     /// What is trusted.
     Trust(Box<TrustTold>),
+    /// Who may do what.
+    Access(Box<Register>),
     /// A component's bytes. Never written by serde: see [`encode_reply`].
     #[serde(skip)]
     Bytes(Vec<u8>),
@@ -271,7 +276,7 @@ pub(crate) enum Notice {
     Standing {
         /// Of the library.
         library: u64,
-        /// Of the intents.
+        /// Of the intents and of the accounts.
         intents: u64,
     },
     /// A component came, or what people wrote about it changed.

@@ -37,6 +37,7 @@ fn asker(client: &str) -> Asker {
     Asker {
         by: format!("Modbus client {client}"),
         via: Via::Modbus,
+        verified: false,
         from: client.to_owned(),
     }
 }

@@ -147,6 +147,11 @@ pub enum Error {
         /// Its name.
         name: String,
     },
+    /// Accounts that cannot be read.
+    #[error(
+        "the accounts on this disk cannot be read: give the host an empty data folder, and it takes them from the others"
+    )]
+    Access,
     /// A text that makes no entry of the audit trail.
     #[error("an entry of the audit trail cannot be made: report this, it is a fault of the program")]
     Audit(#[source] bumpless_core::audit::Misfit),

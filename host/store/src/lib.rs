@@ -26,6 +26,7 @@
 //! All calls block on the disk. Async callers use a blocking thread. A wait for another writer is as long as that one's
 //! fsync: the operating system's bound, not ours.
 
+mod access;
 mod alarms;
 mod archive;
 mod audit;

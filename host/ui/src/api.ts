@@ -1,6 +1,7 @@
 // Questions to the host that served the page. A failure is a Problem with its cure, never a bare status.
 // Never: another host; a page speaks to its own origin only.
 
+import { csrf, unknown } from "./access";
 import { by } from "./who";
 
 /** Why a question failed, in the host's own words. */
@@ -24,11 +25,13 @@ async function ask<T>(method: string, path: string, body?: BodyInit, headers: Re
   let response: Response;
   try {
     // Who asks goes with what changes something. A header carries bytes; the name's are UTF-8.
-    const named = method === "GET" ? headers : { ...headers, "x-by": String.fromCharCode(...new TextEncoder().encode(by())) };
+    const named: Record<string, string> = method === "GET" ? headers : { ...headers, "x-by": String.fromCharCode(...new TextEncoder().encode(by())) };
+    if (method !== "GET" && csrf()) named["x-csrf-token"] = csrf();
     response = await fetch(path, { method, body, headers: named, signal: AbortSignal.timeout(TIME_MAX_MS) });
   } catch (error) {
     throw new Problem(0, "The host does not answer", String(error instanceof Error ? error.message : error), "look at the connection");
   }
+  if (response.status === 401) unknown();
   if (!response.ok) {
     const text = await response.text();
     try {

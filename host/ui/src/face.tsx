@@ -3,6 +3,7 @@
 import { useEffect, useState } from "preact/hooks";
 import { limits_of } from "./alarms";
 import { LoopAlarms } from "./alarm_parts";
+import { Needing } from "./sign_in";
 import { command, get, remove, send } from "./api";
 import { abnormal } from "./overview";
 import { ago, clock, duration_us, number, value, zone } from "./format";
@@ -73,8 +74,10 @@ function FaceOf({ loop }: { loop: Followed }) {
           <Happened loop={loop.name} />
         </div>
         <div class="side">
-          <Operate loop={loop} />
-          <LoopAlarms loop={loop.name} />
+          <Needing role="operator" loop={loop.name}>
+            <Operate loop={loop} />
+            <LoopAlarms loop={loop.name} />
+          </Needing>
           {spec && <Run spec={spec} loop={loop} />}
           {spec && info && <Tune spec={spec} info={info} />}
           {spec && <Redundancy key={`redundancy-${spec.revision}`} spec={spec} put={(draft) => put(spec.name, draft)} />}

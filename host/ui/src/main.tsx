@@ -3,6 +3,7 @@
 import { effect, signal } from "@preact/signals";
 import { render } from "preact";
 import { useEffect, useRef } from "preact/hooks";
+import { keep_looking, look, me, must_sign_in } from "./access";
 import { follow_alarms, unseen } from "./alarms";
 import { Bell } from "./alarm_parts";
 import { Alarms, FloodBanner } from "./alarms_view";
@@ -18,6 +19,7 @@ import { forced, here, hosts, link, loops, lost_at, notices, start, tick, troubl
 import { Library, take_into_library } from "./library";
 import { Overview, abnormal } from "./overview";
 import { Rollouts } from "./rollouts";
+import { Needing, Signed, SignIn } from "./sign_in";
 import "./style.css";
 import { set_theme, show, theme } from "./theme";
 import { complain, Dialog, Messages, undo_last } from "./ui";
@@ -54,6 +56,19 @@ const dragging = signal(false);
 
 function View() {
   const [what = "", name = ""] = place.value;
+  // Lists have an act beside each loop; whether it is one's own is the host's to say.
+  const about = ["loop", "change"].includes(what) ? name : ["", "alarms"].includes(what) ? "" : undefined;
+  return (
+    <Needing role={ROLES[what] ?? "engineer"} loop={about}>
+      <Place what={what} name={name} />
+    </Needing>
+  );
+}
+
+/** What acts of a place need where nothing narrower is said; of the others, an engineer. */
+const ROLES: Record<string, "viewer" | "operator"> = { "": "operator", alarms: "operator", events: "viewer", lab: "viewer", audit: "viewer" };
+
+function Place({ what, name }: { what: string; name: string }) {
   switch (what) {
     case "":
       return <Overview />;
@@ -183,9 +198,15 @@ function Frame() {
           <button type="button" class="plain" aria-label={`Colours: ${theme.value}. Change`} title={`Colours: ${theme.value}`} onClick={() => set_theme(theme.value === "system" ? "dark" : theme.value === "dark" ? "light" : "system")}>
             {theme.value === "dark" ? "☾" : theme.value === "light" ? "☀" : "◐"}
           </button>
-          <button type="button" class="plain who-button" aria-label={`${who.value || "no name"}: your name, for the record. Change`} title="your name, for the record" onClick={() => (naming.value = true)}>
-            {who.value || "no name"}
-          </button>
+          {me.value?.name ? (
+            <button type="button" class="plain who-button" title="who you are, and the way out" onClick={() => (naming.value = true)}>
+              {me.value.name} <small>{me.value.role}</small>
+            </button>
+          ) : (
+            <button type="button" class="plain who-button" aria-label={`${who.value || "no name"}: your name, for the record. Change`} title="your name, for the record; nobody is asked here" onClick={() => (naming.value = true)}>
+              {who.value || "no name"}
+            </button>
+          )}
           <button type="button" class="plain" aria-label="Keys and help" onClick={() => (help.value = true)}>
             ?
           </button>
@@ -204,7 +225,7 @@ function Frame() {
       <Messages />
       <Urgent />
       {dragging.value && <div class="dropping">Drop the component: {what === "change" || what === "loop" ? `the way to change ${place.value[1]} begins` : "it goes to the library"}</div>}
-      {naming.value && <Naming />}
+      {naming.value && (me.value?.name ? <Dialog title="Signed in" close={() => (naming.value = false)}><Signed close={() => (naming.value = false)} /></Dialog> : <Naming />)}
       {help.value && (
         <Dialog title="Keys" close={() => (help.value = false)}>
           <dl>
@@ -231,7 +252,7 @@ function Frame() {
 function Naming() {
   return (
     <Dialog title="Who are you?" close={() => (naming.value = false)}>
-      <p>A name that goes with what you do: acknowledging, forcing, changing. It proves nothing, and it is kept in this browser.</p>
+      <p>A name that goes with what you do: acknowledging, forcing, changing. It proves nothing, and it is kept in this browser: this host asks nobody who he is, so whoever reaches it may do everything.</p>
       <form
         method="dialog"
         class="enter"
@@ -282,16 +303,45 @@ addEventListener("drop", (event) => {
   }
 });
 
+/** The page, once the host knows who looks at it. */
+function Page() {
+  if (me.value === null) return <p class="none">Asking the host…</p>;
+  return must_sign_in.value ? <SignIn /> : <Frame />;
+}
+
+let started = false;
+/** Begins to follow the cell: once, and not before the host would answer. */
+function begin(): void {
+  if (started) return;
+  started = true;
+  start();
+  follow_alarms();
+  effect(() => {
+    // With each beat of the hosts.
+    hosts.value;
+    note_steps();
+  });
+}
+
 show();
-start();
-follow_alarms();
 effect(() => {
-  // With each beat of the hosts.
-  hosts.value;
-  note_steps();
+  if (me.value !== null && !must_sign_in.value) begin();
 });
 const root = document.getElementById("page");
 if (root) {
   root.textContent = "";
-  render(<Frame />, root);
+  render(<Page />, root);
 }
+/** Pause before a host that did not answer is asked again, in ms. */
+const AGAIN_MS = 2_000;
+async function ask_first(): Promise<void> {
+  while (me.peek() === null) {
+    try {
+      await look();
+    } catch {
+      await new Promise((resolve) => setTimeout(resolve, AGAIN_MS));
+    }
+  }
+  keep_looking();
+}
+void ask_first();

@@ -6,6 +6,7 @@ import { useEffect, useId, useRef, useState } from "preact/hooks";
 import { words } from "./api";
 import { value } from "./format";
 import { link } from "./live";
+import { useRefusal } from "./sign_in";
 import type { Limit } from "./alarms";
 
 /** A message at the lower edge. */
@@ -86,6 +87,7 @@ export function Act(props: {
   pressed?: boolean;
 }) {
   const [busy, set_busy] = useState(false);
+  const refusal = useRefusal();
   const go = async (): Promise<void> => {
     set_busy(true);
     try {
@@ -100,11 +102,11 @@ export function Act(props: {
     <button
       type="button"
       class={props.class}
-      disabled={busy || props.off || link.value !== "live"}
+      disabled={busy || props.off || link.value !== "live" || refusal !== ""}
       aria-busy={busy}
       aria-label={props.label}
       aria-pressed={props.pressed}
-      title={props.title}
+      title={refusal || props.title}
       onClick={() => void go()}
     >
       {props.children}
@@ -143,9 +145,10 @@ export function Dialog(props: { title: string; close: () => void; children: Comp
 export function Danger(props: { label: string; title: string; text: string; name: string; act: () => Promise<unknown>; off?: boolean }) {
   const [open, set_open] = useState(false);
   const [typed, set_typed] = useState("");
+  const refusal = useRefusal();
   return (
     <>
-      <button type="button" class="danger" disabled={props.off || link.value !== "live"} onClick={() => set_open(true)}>
+      <button type="button" class="danger" title={refusal || undefined} disabled={props.off || link.value !== "live" || refusal !== ""} onClick={() => set_open(true)}>
         {props.label}
       </button>
       {open && (

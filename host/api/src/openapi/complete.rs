@@ -37,17 +37,27 @@ const CONDITIONAL: [(&str, bool); 9] = [
 /// Operations that are served without a place and a time limit, for they must answer when there is none.
 const UNLIMITED: [&str; 2] = ["is_alive", "is_ready"];
 
+/// Operations for which nobody needs to sign in.
+const OPEN: [&str; 3] = ["is_alive", "is_ready", "who_am_i"];
+
 /// The examples, by operation.
 pub(super) static ALL_EXAMPLES: LazyLock<Map<String, Value>> =
     LazyLock::new(|| serde_json::from_str(EXAMPLES).unwrap_or_default());
 
 /// Status, name and words of the errors that operations share.
-const ERRORS: [(u16, &str, &str); 11] = [
+const ERRORS: [(u16, &str, &str); 14] = [
     (
         400,
         "BadRequest",
         "The address, a header or the text of the body cannot be read",
     ),
+    (401, "SignIn", "This host wants to know who asks"),
+    (
+        403,
+        "Forbidden",
+        "The role or the loops of the asker do not reach so far, or a page of another site asks",
+    ),
+    (429, "TooOften", "Too many in a short time; wait"),
     (404, "NotFound", "The cell has nothing of that name"),
     (
         409,
@@ -162,6 +172,9 @@ fn error(status: u16, words: &str) -> Value {
 const fn kind(status: u16) -> &'static str {
     match status {
         400 => "bad-request",
+        401 => "sign-in",
+        403 => "forbidden",
+        429 => "too-often",
         404 => "not-found",
         409 => "refused",
         412 => "precondition",
@@ -202,7 +215,10 @@ fn of_operation(path: &str, method: &str, operation: &mut Value) {
         parameters.is_some_and(|all| all.iter().any(|parameter| parameter["in"] == place))
     };
     let (in_path, in_query, body) = (named("path"), named("query"), operation["requestBody"].is_object());
-    let mut statuses = vec![500];
+    let mut statuses = vec![403, 500];
+    if !OPEN.contains(&id.as_str()) {
+        statuses.extend([401, 429]);
+    }
     if !UNLIMITED.contains(&id.as_str()) {
         statuses.extend([503, 504]);
     }

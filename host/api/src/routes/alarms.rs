@@ -7,7 +7,7 @@ use axum::{
     response::{IntoResponse as _, Response},
 };
 use bumpless_core::LoopId;
-use bumpless_deploy::alarms::AlarmAct;
+use bumpless_deploy::{alarms::AlarmAct, audit::Asker};
 use serde::Deserialize;
 use utoipa::IntoParams;
 
@@ -191,6 +191,7 @@ pub(crate) async fn act(
     Json(request): Json<AlarmActRequest>,
 ) -> Result<JsonAnswer<LoopAlarm>, Problem> {
     let (act, by) = request.split();
+    let by = Asker::signed(by);
     let view = app
         .cell
         .act_on_alarm(LoopId::new(&name)?, alarm.clone(), act, by)

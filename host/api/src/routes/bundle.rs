@@ -7,7 +7,7 @@ use axum::{
     http::{HeaderMap, HeaderValue, header},
     response::{IntoResponse as _, Response},
 };
-use bumpless_deploy::limits::BUNDLE_BYTES_MAX;
+use bumpless_deploy::{audit::Asker, limits::BUNDLE_BYTES_MAX};
 use serde::Deserialize;
 use utoipa::IntoParams;
 
@@ -103,7 +103,7 @@ pub(crate) async fn import(
     body: Body,
 ) -> Result<JsonAnswer<Imports>, Problem> {
     content_type(&headers, &["application/x-tar", "application/octet-stream"])?;
-    let by = words(query.by, &headers, "x-by")?;
+    let by = Asker::signed(words(query.by, &headers, "x-by")?);
     let by = if by.is_empty() { "api".to_owned() } else { by };
     let _room = match room(&app) {
         Ok(room) => room,

@@ -10,7 +10,7 @@ use axum::{
     response::{IntoResponse as _, Response},
 };
 use bumpless_core::{ComponentInfo, limits::COMPONENT_BYTES_MAX};
-use bumpless_deploy::{ComponentView, Relabel, Upload};
+use bumpless_deploy::{ComponentView, Relabel, Upload, audit::Asker};
 use serde::Deserialize;
 use utoipa::IntoParams;
 
@@ -188,7 +188,7 @@ pub(crate) async fn upload(
         &["application/wasm", "application/octet-stream", "text/x-lua"],
     )?;
     let note = words(query.note, &headers, "x-note")?;
-    let by = words(query.by, &headers, "x-by")?;
+    let by = Asker::signed(words(query.by, &headers, "x-by")?);
     let by = if by.is_empty() { "api".to_owned() } else { by };
     let labels = labels(query.labels.as_deref())?;
     // Nothing is kept before there is room for all of it.
@@ -266,6 +266,7 @@ pub(crate) async fn relabel(
         .map(|note| words(Some(note), &headers, "note"))
         .transpose()?;
     let by = words(Some(request.by).filter(|by| !by.is_empty()), &headers, "x-by")?;
+    let by = Asker::signed(by);
     let change = Relabel {
         by: if by.is_empty() { "api".to_owned() } else { by },
         note,

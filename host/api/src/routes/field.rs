@@ -7,6 +7,7 @@ use axum::{
     response::{IntoResponse as _, Response},
 };
 use bumpless_core::PointId;
+use bumpless_deploy::audit::Asker;
 use serde::Deserialize;
 use utoipa::IntoParams;
 
@@ -42,7 +43,7 @@ pub(crate) async fn write(
 ) -> Result<JsonAnswer<Point>, Problem> {
     let view = app
         .cell
-        .write_point(PointId::new(name)?, request.value, request.by)
+        .write_point(PointId::new(name)?, request.value, Asker::signed(request.by))
         .await?;
     Ok(JsonAnswer(view.into()))
 }
@@ -78,7 +79,10 @@ pub(crate) async fn unforce(
     Json(request): Json<ByRequest>,
 ) -> Result<JsonAnswer<Point>, Problem> {
     Ok(JsonAnswer(
-        app.cell.unforce(PointId::new(name)?, request.by).await?.into(),
+        app.cell
+            .unforce(PointId::new(name)?, Asker::signed(request.by))
+            .await?
+            .into(),
     ))
 }
 
@@ -201,5 +205,7 @@ pub(crate) async fn cancel(
     InPath(id): InPath<String>,
     Json(request): Json<ByRequest>,
 ) -> Result<JsonAnswer<Job>, Problem> {
-    Ok(JsonAnswer(app.cell.cancel_job(id, request.by).await?.into()))
+    Ok(JsonAnswer(
+        app.cell.cancel_job(id, Asker::signed(request.by)).await?.into(),
+    ))
 }

@@ -5,7 +5,31 @@ use bumpless_deploy::report::{
     CurvePoint, IndexReport, OutputReport, ShadowView, StepTimes, Trial, TrialReport, Verdict,
 };
 
-use super::fake::digest;
+use super::fake::{digest, host};
+
+/// A report of a trial.
+pub(super) fn admission(verdict: bumpless_core::Verdict) -> bumpless_core::Admission {
+    bumpless_core::Admission {
+        checked_at_unix_ms: 1,
+        host: host(),
+        verdict,
+        cycles: 400,
+        steps: 300,
+        step_p50_ns: 1_500,
+        step_p99_ns: 2_500,
+        step_worst_ns: 9_000,
+        start_ns: 4_000,
+        migrated: bumpless_core::Migrated::Declined,
+        migrate_ns: 3_000,
+        state_bytes: 40,
+        memory_bytes: 1_048_576,
+        compile_ms: None,
+        findings: vec![bumpless_core::Finding {
+            severity: bumpless_core::Severity::Refusal,
+            text: "it trapped".to_owned(),
+        }],
+    }
+}
 
 pub(super) fn trial() -> Trial {
     Trial {

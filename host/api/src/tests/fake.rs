@@ -7,8 +7,7 @@ use std::sync::{
 
 use bumpless_core::{
     Applied, CommandBody, CommandId, ComponentInfo, Descriptor, Digest, Direction, Event, HostId, LoopId, LoopSpec,
-    Migrated, Mode, Outcome, PointId, Policy, PortKind, PortSpec, Reading, Record, Strategy, desk::Tally,
-    history::Series,
+    Mode, Outcome, PointId, Policy, PortKind, PortSpec, Reading, Record, Strategy, desk::Tally, history::Series,
 };
 use bumpless_deploy::{
     ApplyEnd, Call, CallEnd, Change, CommandEnd, ComponentView, Counters, DrainEnd, DrainOrder, Error, Expect,
@@ -26,7 +25,7 @@ use tokio::sync::{Notify, broadcast};
 
 use super::{
     alarms::alarms,
-    candidates::{shadow, trial, trial_report},
+    candidates::{admission, shadow, trial, trial_report},
     history::history,
     hosts,
     rollouts::rollout,
@@ -65,6 +64,7 @@ pub(crate) struct Fake {
     pub(crate) news: broadcast::Sender<bumpless_deploy::commissioning::FieldEvent>,
     pub(crate) alarm_news: broadcast::Sender<Arc<AlarmEvent>>,
     pub(crate) trail: Mutex<super::audit::Trail>,
+    pub(crate) guests: Mutex<super::guests::Guests>,
     records: broadcast::Sender<Arc<Record>>,
 }
 
@@ -94,6 +94,7 @@ impl Fake {
             news: broadcast::channel(FEED_CAPACITY).0,
             alarm_news: broadcast::channel(FEED_CAPACITY).0,
             trail: Mutex::default(),
+            guests: Mutex::default(),
             records: broadcast::channel(FEED_CAPACITY).0,
         }
     }
@@ -170,30 +171,6 @@ fn info() -> ComponentInfo {
         changes: 0,
         history: Vec::new(),
         admission: None,
-    }
-}
-
-/// A report of a trial.
-fn admission(verdict: bumpless_core::Verdict) -> bumpless_core::Admission {
-    bumpless_core::Admission {
-        checked_at_unix_ms: 1,
-        host: host(),
-        verdict,
-        cycles: 400,
-        steps: 300,
-        step_p50_ns: 1_500,
-        step_p99_ns: 2_500,
-        step_worst_ns: 9_000,
-        start_ns: 4_000,
-        migrated: Migrated::Declined,
-        migrate_ns: 3_000,
-        state_bytes: 40,
-        memory_bytes: 1_048_576,
-        compile_ms: None,
-        findings: vec![bumpless_core::Finding {
-            severity: bumpless_core::Severity::Refusal,
-            text: "it trapped".to_owned(),
-        }],
     }
 }
 

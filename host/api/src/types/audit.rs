@@ -30,7 +30,7 @@ pub struct AuditEntry {
     pub number: u64,
     /// What was done, such as `loop.setpoint` or `point.force`.
     pub what: String,
-    /// Who did it, as he said of himself; empty where nobody said.
+    /// Who did it: the account, or on a host that asks nobody what he said of himself; empty where nobody said.
     pub by: String,
     /// The way in: `api`, `modbus`, `rollout`, or `host` for what a host did of itself.
     pub via: String,

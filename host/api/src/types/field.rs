@@ -3,6 +3,7 @@
 use bumpless_core::HostId;
 use bumpless_deploy::{
     Error as DeployError,
+    audit::Asker,
     commissioning::{self as model, ForceView, JobTask, ScanPlan},
 };
 use serde::{Deserialize, Serialize};
@@ -66,7 +67,7 @@ impl From<ForceRequest> for model::ForceDraft {
         Self {
             value: request.value,
             seconds: request.seconds,
-            by: request.by,
+            by: Asker::signed(request.by),
             why: request.why,
         }
     }
@@ -369,7 +370,7 @@ impl TryFrom<JobRequest> for model::JobDraft {
             bus: request.bus,
             task,
             key: request.key,
-            by: request.by,
+            by: Asker::signed(request.by),
             queue_ms: request.queue_ms.unwrap_or(QUEUE_MS_DEFAULT),
             timeout_ms: request.timeout_ms,
         })

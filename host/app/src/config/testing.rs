@@ -13,6 +13,9 @@ use crate::error::Error;
 pub(super) struct TestingTable {
     #[serde(skip_serializing_if = "Option::is_none")]
     flip_bits_every: Option<u64>,
+    /// The network is the test's own: nobody is asked, and nothing is refused for being open.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub(super) open_network: bool,
 }
 
 impl TestingTable {
@@ -25,17 +28,20 @@ impl TestingTable {
         cell: &CellName,
         wrong: &dyn Fn(&str, String) -> Error,
     ) -> Result<Option<std::num::NonZeroU64>, Error> {
-        let Some(every) = self.flip_bits_every else {
+        if self.is_empty() {
             return Ok(None);
-        };
+        }
         if !cell.as_str().starts_with("test") {
             return Err(wrong(
                 "testing",
                 format!(
-                    "it makes the host err on purpose, and cell {cell} may be a real one; remove it, or use a cell whose name begins with \"test\""
+                    "it makes the host err or lie open on purpose, and cell {cell} may be a real one; remove it, or use a cell whose name begins with \"test\""
                 ),
             ));
         }
+        let Some(every) = self.flip_bits_every else {
+            return Ok(None);
+        };
         let every = super::in_range(wrong, "testing.flip_bits_every", Some(every), 1, 1, 1_000_000_000)?;
         Ok(std::num::NonZeroU64::new(every))
     }

@@ -41,12 +41,22 @@ fn a_full_file_is_taken_as_it_stands() {
         headers = { api-key = "k" }
         [cell]
         name = "demo"
-        listen = ["tcp/10.0.0.1:7447"]
-        connect = ["tcp/10.0.0.2:7447"]
+        listen = ["tls/10.0.0.1:7447"]
+        connect = ["tls/10.0.0.2:7447"]
         scouting = true
         lease_ms = 300
+        [cell.tls]
+        ca = "ca.pem"
+        certificate = "plant.pem"
+        key = "/keys/plant.key"
+        members = ["plant", "a"]
         [api]
-        listen = "[::1]:80"
+        listen = "10.0.0.1:443"
+        names = ["plant.example"]
+        [api.tls]
+        certificate = "plant.pem"
+        key = "plant.key"
+        [security]
         [roles]
         control = true
         [[bus]]
@@ -67,6 +77,17 @@ fn a_full_file_is_taken_as_it_stands() {
     assert_eq!((config.io, config.control), (true, true));
     assert_eq!(config.data, Path::new("/var/lib/bumpless"));
     assert_eq!((config.cell.lease_ms, config.cell.scouting), (300, true));
+    assert!(config.secured && !config.doors && config.api_names == ["plant.example"]);
+    let tls = config.cell.tls.expect("certificates");
+    assert_eq!(
+        (tls.ca.as_path(), tls.key.as_path()),
+        (Path::new("/etc/bumpless/ca.pem"), Path::new("/keys/plant.key"))
+    );
+    assert!(
+        config
+            .api_tls
+            .is_some_and(|files| files.certificate == Path::new("/etc/bumpless/plant.pem"))
+    );
     assert_eq!((config.loops.workers, config.history_bytes_max), (3, None));
     let otlp = config.otlp.expect("a collector");
     assert!(otlp.metrics && otlp.traces && otlp.every_s == 15);
@@ -81,7 +102,7 @@ fn a_full_file_is_taken_as_it_stands() {
 #[test]
 fn bad_files_say_where_and_what_helps() {
     let bus = "[[bus]]\nid = \"plant\"\ndriver = \"sim\"\n";
-    let table: [(String, &[&str]); 24] = [
+    let table: [(String, &[&str]); 33] = [
         (
             format!("{LEAST}[testing]\nflip_bits_every = 5"),
             &["key testing", "cell demo may be a real one", "begins with \"test\""],
@@ -170,6 +191,44 @@ fn bad_files_say_where_and_what_helps() {
         (
             format!("{LEAST}[otlp]\nendpoint = \"collector:4318\""),
             &["key otlp", "http://HOST:PORT"],
+        ),
+        (
+            format!("{LEAST}[api]\nlisten = \"0.0.0.0:8480\""),
+            &["key api.listen", "needs [security] and [api.tls]"],
+        ),
+        (
+            format!("{LEAST}[security]\n[api]\nlisten = \"10.0.0.1:8480\""),
+            &["key api.listen", "needs [api.tls]"],
+        ),
+        (
+            format!("{LEAST}[api]\nlisten = \"[::]:8480\"\n[api.tls]\ncertificate = \"a\"\nkey = \"b\""),
+            &["key api.listen", "needs [security];"],
+        ),
+        (
+            format!(
+                "{LEAST}[security]\nusers = false\n[api]\nlisten = \"[::]:8480\"\n[api.tls]\ncertificate = \"a\"\nkey = \"b\""
+            ),
+            &["key api.listen", "needs [security];"],
+        ),
+        (
+            format!("{LEAST}listen = [\"tcp/0.0.0.0:7447\"]"),
+            &["key cell.listen", "without TLS", "[cell.tls]"],
+        ),
+        (
+            format!("{LEAST}connect = [\"tcp/plant.example:7447\"]"),
+            &["key cell.connect", "without TLS"],
+        ),
+        (
+            format!("{LEAST}scouting = true"),
+            &["key cell.scouting", "strangers could join"],
+        ),
+        (
+            format!("{LEAST}[cell.tls]\nca = \"a\"\ncertificate = \"b\"\nkey = \"c\"\nmembers = [\"b\"]"),
+            &["key cell", "this one too"],
+        ),
+        (
+            format!("{LEAST}[testing]\nopen_network = true"),
+            &["key testing", "lie open on purpose", "cell demo may be a real one"],
         ),
         (format!("{LEAST}[[["), &["line 4"]),
     ];

@@ -69,7 +69,7 @@ impl Feed {
     }
 
     fn open(client: &Client, path: String) -> Result<Self, Error> {
-        let first = client.api().to_owned();
+        let first = client.clone();
         let (sender, news) = sync_channel(QUEUE_MAX);
         std::thread::Builder::new()
             .name("feed".to_owned())
@@ -90,13 +90,13 @@ impl Feed {
 }
 
 /// Reads until nobody listens any more.
-fn follow(first: String, path: &str, news: &SyncSender<News>) {
-    let mut apis = vec![first];
+fn follow(first: Client, path: &str, news: &SyncSender<News>) {
+    let mut apis = vec![first.api().to_owned()];
     let mut turn = 0;
     let mut answered_at = Instant::now();
     loop {
         let api = apis[turn % apis.len()].clone();
-        let (end, had_answered) = match Client::new(&api).and_then(|client| client.stream(path, SILENCE_MAX)) {
+        let (end, had_answered) = match first.at(&api).and_then(|client| client.stream(path, SILENCE_MAX)) {
             Ok(stream) => {
                 if news.send(News::Connected(api.clone())).is_err() {
                     return;

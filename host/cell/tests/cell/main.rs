@@ -11,6 +11,7 @@
     reason = "tests"
 )]
 
+mod guarded;
 mod joining;
 mod lanes;
 mod malformed;

@@ -2,7 +2,7 @@
 //!
 //! Known where a request comes in, and needed where the change is written down; what lies between need not carry it. So it goes
 //! with the task: [`Asker::asks`] runs a piece of work in somebody's name, [`Asker::current`] says in whose name this runs.
-//! Never: proves anything. Without authentication a name is what somebody says of himself.
+//! Never: proves anything. A name that was not proved ([`Asker::verified`]) is what somebody says of himself.
 
 use std::fmt;
 
@@ -53,6 +53,8 @@ pub struct Asker {
     pub by: String,
     /// How he reaches the host.
     pub via: Via,
+    /// Was the name proved, by a password or a token?
+    pub verified: bool,
     /// His address, as `address:port`; empty where there is none.
     pub from: String,
 }
@@ -62,6 +64,13 @@ impl Asker {
     #[must_use]
     pub fn current() -> Self {
         ASKER.try_with(Clone::clone).unwrap_or_default()
+    }
+
+    /// The name for something that a request says is by somebody: the proved one, where there is one.
+    #[must_use]
+    pub fn signed(by: String) -> String {
+        let asker = Self::current();
+        if asker.verified { asker.by } else { by }
     }
 
     /// Does work in his name.
@@ -80,6 +89,7 @@ mod tests {
             by: "ann".to_owned(),
             via: Via::Api,
             from: "192.0.2.1:5000".to_owned(),
+            verified: true,
         };
         assert_eq!(Asker::current(), Asker::default());
         let told = ann.clone().asks(async { Asker::current() }).await;

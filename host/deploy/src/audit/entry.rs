@@ -129,6 +129,20 @@ kinds! {
     HostUndrain = "host.undrain",
     /// A write was refused by the map of a Modbus server.
     ModbusRefuse = "modbus.refuse",
+    /// An account was added.
+    UserAdd = "user.add",
+    /// An account was changed.
+    UserChange = "user.change",
+    /// An account was removed.
+    UserRemove = "user.remove",
+    /// A token was made.
+    TokenIssue = "token.issue",
+    /// A token was revoked.
+    TokenRevoke = "token.revoke",
+    /// Somebody signed in, or tried to.
+    SessionBegin = "session.begin",
+    /// Somebody was refused for what he may not do.
+    AccessRefuse = "access.refuse",
     /// The trail was opened: the host started.
     TrailOpened = "trail.opened",
     /// The oldest entries were removed, for the trail is beyond its bound.
@@ -157,7 +171,7 @@ pub struct AuditEntry {
     pub at: String,
     /// What was done: see [`AuditKind::name`].
     pub what: String,
-    /// Who did it, as he said of himself; empty where nobody said.
+    /// Who did it: the account, or on a host that asks nobody what he said of himself; empty where nobody said.
     pub by: String,
     /// How he reached the host: see [`super::Via::name`].
     pub via: String,
@@ -309,7 +323,12 @@ impl Act {
     }
 
     fn entry(&self, asker: &Asker) -> AuditEntry {
-        let by = if self.by.is_empty() { &asker.by } else { &self.by };
+        // Who was proved to be somebody is that one, whatever the request says.
+        let by = if self.by.is_empty() || asker.verified {
+            &asker.by
+        } else {
+            &self.by
+        };
         AuditEntry {
             at: now_text(),
             what: self.kind.name().to_owned(),

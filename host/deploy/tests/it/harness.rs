@@ -160,6 +160,7 @@ impl Cell {
             webhooks: vec![],
             host_alarms: bumpless_deploy::HostAlarms::default(),
             trust_roots: Vec::new(),
+            secured: false,
         })
         .expect("deployment starts");
         *field.deploy.lock() = Some(started.clone());

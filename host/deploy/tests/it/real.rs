@@ -119,6 +119,7 @@ pub(crate) async fn host(cell: &Cell, dir: &std::path::Path) -> Real {
         webhooks: vec![],
         host_alarms: bumpless_deploy::HostAlarms::default(),
         trust_roots: Vec::new(),
+        secured: false,
     })
     .unwrap();
     *slot.lock() = Some(deploy.clone());
