@@ -3,9 +3,9 @@
 //! | role | may |
 //! |---|---|
 //! | viewer | look |
-//! | operator | setpoint, mode, output, points by hand, alarms |
-//! | engineer | loops, components, parameters, forces, jobs, rollouts, trials, hosts |
-//! | admin | accounts and tokens |
+//! | operator | setpoint, mode, output, points by hand, alarms, programs' start, pause and stop |
+//! | engineer | loops, programs, components, signatures, parameters, forces, jobs, rollouts, trials, hosts |
+//! | admin | accounts, tokens, the document of trust |
 //!
 //! Never: decides; `bumpless_access` does.
 
@@ -63,7 +63,12 @@ const TABLE: &[(&str, &str, Who)] = &[
     ("PATCH", "/v1/components/{reference}", ENGINEER_CELL),
     ("DELETE", "/v1/components/{reference}", ENGINEER_CELL),
     ("GET", "/v1/components/{reference}/bytes", ENGINEER_LOOK),
+    ("GET", "/v1/components/{reference}/script", ENGINEER_LOOK),
     ("POST", "/v1/components/{reference}/call", ENGINEER_LOOK),
+    ("GET", "/v1/signatures/{digest}", LOOK),
+    ("POST", "/v1/signatures/{digest}", ENGINEER_CELL),
+    ("GET", "/v1/trust", LOOK),
+    ("PUT", "/v1/trust", ADMIN),
     ("GET", "/v1/bundle", ENGINEER_LOOK),
     ("POST", "/v1/bundle", ENGINEER_CELL),
     ("GET", "/v1/loops", LOOK),
@@ -86,6 +91,13 @@ const TABLE: &[(&str, &str, Who)] = &[
     ("POST", "/v1/loops/{name}/shadows", ENGINEER),
     ("GET", "/v1/loops/{name}/shadows/{id}", LOOK),
     ("DELETE", "/v1/loops/{name}/shadows/{id}", ENGINEER),
+    ("GET", "/v1/programs", LOOK),
+    ("POST", "/v1/programs", ENGINEER_CELL),
+    ("GET", "/v1/programs/{name}", LOOK),
+    ("DELETE", "/v1/programs/{name}", ENGINEER_CELL),
+    ("POST", "/v1/programs/{name}/order", OPERATE_CELL),
+    ("GET", "/v1/programs/{name}/log", LOOK),
+    ("GET", "/v1/programs/{name}/checkpoint", ENGINEER_LOOK),
     ("GET", "/v1/rollouts", LOOK),
     ("POST", "/v1/rollouts", ENGINEER_CELL),
     ("GET", "/v1/rollouts/{id}", LOOK),
