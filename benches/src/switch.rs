@@ -308,6 +308,13 @@ fn tell_turns(report: &mut Report, turns: impl Iterator<Item = (Felt, Felt)>) {
     }
     with.tell(report, "swap.turns_with_swaps", Bound::None, Bound::None);
     without.tell(report, "swap.turns_without", Bound::None, Bound::None);
+    // Losses come in clusters, so the sum alone says little: in how many pairs was which turn the worse one?
+    let worse = |sign: f64| differences.iter().filter(|d| **d * sign > 0.0).count() as f64;
+    report.told("swap.pairs_of_turns", differences.len() as f64, "pairs");
+    report.told("swap.pairs_worse_with_swaps", worse(1.0), "pairs");
+    report.told("swap.pairs_worse_without", worse(-1.0), "pairs");
+    let most = differences.iter().copied().fold(0.0, f64::max);
+    report.told("swap.most_lost_in_one_turn", most, "cycles");
     report.figure(
         "swap.cycles_lost_by_swaps",
         excess(&differences),
