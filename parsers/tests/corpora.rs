@@ -2,7 +2,7 @@
 //!
 //! Never: libFuzzer; `cargo xtask fuzz` has it.
 
-#![allow(clippy::unwrap_used, reason = "tests")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests")]
 
 use std::{
     collections::BTreeSet,

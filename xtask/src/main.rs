@@ -72,7 +72,7 @@ enum Command {
     /// Writes what the product is made of (CycloneDX) and from what it was built (in-toto, SLSA) to target/sbom.
     Sbom {
         /// Files of the release; the binary of target/release and the stock components where none are named.
-        files: Vec<std::path::PathBuf>,
+        files: Vec<PathBuf>,
     },
     /// Writes docs/openapi.json from the code.
     Openapi,

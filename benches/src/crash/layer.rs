@@ -276,20 +276,20 @@ impl Disk {
             for change in &changes {
                 match change {
                     Unsynced::Write { at, after, .. } => {
-                        let all = self.chance() % 3 == 0;
+                        let all = self.chance().is_multiple_of(3);
                         let mut at = *at;
                         let mut rest = after.as_slice();
                         while !rest.is_empty() {
                             let to_border = SECTOR - usize::try_from(at % SECTOR as u64).unwrap_or_default();
                             let (sector, later) = rest.split_at(to_border.min(rest.len()));
-                            if all || self.chance() % 2 == 0 {
+                            if all || self.chance().is_multiple_of(2) {
                                 file.write_all_at(sector, at)?;
                             }
                             at += sector.len() as u64;
                             rest = later;
                         }
                     }
-                    Unsynced::Length { after, .. } if self.chance() % 2 == 0 => file.set_len(*after)?,
+                    Unsynced::Length { after, .. } if self.chance().is_multiple_of(2) => file.set_len(*after)?,
                     Unsynced::Length { .. } => {}
                 }
             }

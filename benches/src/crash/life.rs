@@ -234,7 +234,7 @@ fn write(stores: &Stores, kind: &str, n: u64, date_ns: u64) -> Result<u64, Error
         _ => {
             stores.archive.offer(Arc::new(record(n, date_ns)?));
             stores.archive.flush()?;
-            if n % 5 == 0 {
+            if n.is_multiple_of(5) {
                 stores.archive.pack()?;
             }
         }

@@ -15,6 +15,9 @@ use serde::{Deserialize, Serialize};
 use super::life::{self, Stores, component, loop_id, row, series};
 use crate::error::Error;
 
+/// What a table keeps in this bench: the number of a round, and numbers that follow from it.
+type Row = (u64, Vec<u64>);
+
 /// What there is.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Sight {
@@ -70,19 +73,16 @@ fn seen(stores: &Stores, round: u64) -> Result<Sight, Error> {
             sight.half.push(format!("component {}", digest.short()));
         }
     }
-    let mut rows: Vec<(&str, Option<(u64, Vec<u64>)>)> = vec![
+    let mut rows: Vec<(&str, Option<Row>)> = vec![
         ("rollout", store.rollouts()?.pop().map(|(_, held)| held)),
         (
             "force",
-            store
-                .forces::<(u64, Vec<u64>)>()?
-                .pop()
-                .map(|(_, held): (PointId, _)| held),
+            store.forces::<Row>()?.pop().map(|(_, held): (PointId, _)| held),
         ),
         ("setting", store.host_value("crash")?),
     ];
     let board = store.alarm_boards()?.pop().map(|(_, held)| held);
-    let told: Vec<(u64, Vec<u64>)> = store.alarm_changes(1)?;
+    let told: Vec<Row> = store.alarm_changes(1)?;
     if board != told.first().cloned() {
         sight.half.push("an alarm's board and what happened to it".to_owned());
     }

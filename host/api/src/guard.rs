@@ -22,7 +22,7 @@ use axum::{
     middleware::Next,
     response::{IntoResponse as _, Response},
 };
-use bumpless_access::{Pace, Principal, Reach, limits::PACES_MAX};
+use bumpless_access::{Pace, Principal, Reach, Role, limits::PACES_MAX};
 use bumpless_deploy::audit::{Asker, Via};
 use futures_util::StreamExt as _;
 
@@ -359,7 +359,7 @@ async fn admitted(app: &App, mut request: Request, next: Next) -> Result<Respons
     let is_feed = path == "/v1/live";
     let response = asker.asks(next.run(request)).await;
     Ok(match credential {
-        Some(credential) if is_feed => watched(response, Arc::clone(&app.cell), credential, signed.principal),
+        Some(credential) if is_feed => watched(response, Arc::clone(&app.cell), credential, signed.principal.role),
         _ => response,
     })
 }
@@ -391,12 +391,12 @@ impl Credential {
 }
 
 /// A body that ends when whoever asked for it may not have it any more.
-fn watched(response: Response, cell: Arc<dyn Cell>, credential: Credential, before: Principal) -> Response {
+fn watched(response: Response, cell: Arc<dyn Cell>, credential: Credential, before: Role) -> Response {
     let (parts, body) = response.into_parts();
     let over = async move {
         loop {
             tokio::time::sleep(RECHECK_EVERY).await;
-            if credential.principal(&*cell).is_none_or(|now| now.role < before.role) {
+            if credential.principal(&*cell).is_none_or(|now| now.role < before) {
                 return;
             }
         }

@@ -90,15 +90,12 @@ pub fn create(language: Language, parent: &Path, name: &str, sdk: Option<&Path>)
         let above = path.parent().unwrap_or(&folder);
         fs::create_dir_all(above).map_err(|source| Error::file(above, "made", source))?;
         // Generated bindings have a part that is no text.
-        let bytes = String::from_utf8(bytes).map_or_else(
-            |no_text| no_text.into_bytes(),
-            |text| {
-                text.replace("@NAME@", name)
-                    .replace("@WORD@", &word)
-                    .replace("@SDK@", &sdk.replace('\\', "\\\\"))
-                    .into_bytes()
-            },
-        );
+        let bytes = String::from_utf8(bytes).map_or_else(std::string::FromUtf8Error::into_bytes, |text| {
+            text.replace("@NAME@", name)
+                .replace("@WORD@", &word)
+                .replace("@SDK@", &sdk.replace('\\', "\\\\"))
+                .into_bytes()
+        });
         fs::write(&path, bytes).map_err(|source| Error::file(&path, "written", source))?;
     }
     // The versions that the SDK is tested with: the project builds the same tomorrow, and without a network where they are here.

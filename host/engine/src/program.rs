@@ -261,7 +261,7 @@ impl PreparedProgram {
         let _place = code
             .shared
             .places
-            .take()
+            .take(code.weight)
             .map_err(|error| Fault::Limit(error.to_string()))?;
         let memory_bytes_max = memory_bytes_max.min(code.shared.limits.memory_bytes_max);
         let ground = Ground::new(

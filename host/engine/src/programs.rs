@@ -79,6 +79,8 @@ pub(crate) struct Code {
     pub(crate) shared: Arc<Shared>,
     pub(crate) imports: Vec<String>,
     pub(crate) pre: ProgramPre<Ground>,
+    /// Places that a run takes.
+    pub(crate) weight: u32,
     info: ProgramInfo,
 }
 
@@ -234,7 +236,7 @@ impl Code {
     fn new(shared: &Arc<Shared>, component: &Component) -> Result<Self, Error> {
         let imports = check_program_imports(component)?;
         check_program_export(component)?;
-        check_needs(component, &shared.limits)?;
+        let weight = check_needs(component, &shared.limits)?;
         let world = |error: wasmtime::Error| Error::ProgramWorld { reason: brief(&error) };
         let pre = ProgramPre::new(shared.linker.instantiate_pre(component).map_err(world)?).map_err(world)?;
         let info = describe(shared, &pre)?;
@@ -243,6 +245,7 @@ impl Code {
             shared: Arc::clone(shared),
             imports,
             pre,
+            weight,
             info,
         })
     }

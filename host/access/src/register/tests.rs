@@ -178,9 +178,9 @@ fn what_is_unsound_is_not_taken() {
         bad.accounts.insert(name("root2"), ann);
     });
     spoil(|bad| {
-        bad.accounts
-            .values_mut()
-            .for_each(|a| a.password = Some("plain".to_owned()))
+        for account in bad.accounts.values_mut() {
+            account.password = Some("plain".to_owned());
+        }
     });
     spoil(|bad| bad.accounts.values_mut().for_each(|a| a.note = "x".repeat(300)));
     spoil(|bad| bad.tokens.values_mut().for_each(|t| t.id = "x".to_owned()));

@@ -343,6 +343,7 @@ fn name_and_version(bytes: &[u8]) -> Result<(String, String), Error> {
     Ok(match either {
         Either::Controller(found, _) => (found.descriptor.name, found.descriptor.version),
         Either::Plant(plant, _) => (plant.info().name.clone(), plant.info().version.clone()),
+        Either::Program(program, _) => (program.info().name.clone(), program.info().version.clone()),
     })
 }
 

@@ -120,7 +120,8 @@ pub(super) fn check(open: &Openness<'_>, wrong: &dyn Fn(&str, String) -> Error) 
     if open.testing {
         return Ok(());
     }
-    if !open.api.ip().to_canonical().is_loopback() && !(open.users && open.api_tls) {
+    let guarded = open.users && open.api_tls;
+    if !guarded && !open.api.ip().to_canonical().is_loopback() {
         let missing = match (open.users, open.api_tls) {
             (false, false) => "[security] and [api.tls]",
             (false, true) => "[security]",

@@ -73,7 +73,7 @@ impl Feed {
         let (sender, news) = sync_channel(QUEUE_MAX);
         std::thread::Builder::new()
             .name("feed".to_owned())
-            .spawn(move || follow(first, &path, &sender))
+            .spawn(move || follow(&first, &path, &sender))
             .map_err(|error| Error::start("the thread of the feed", error))?;
         Ok(Self { news })
     }
@@ -90,7 +90,7 @@ impl Feed {
 }
 
 /// Reads until nobody listens any more.
-fn follow(first: Client, path: &str, news: &SyncSender<News>) {
+fn follow(first: &Client, path: &str, news: &SyncSender<News>) {
     let mut apis = vec![first.api().to_owned()];
     let mut turn = 0;
     let mut answered_at = Instant::now();

@@ -205,7 +205,7 @@ fn a_bundle_of_an_earlier_day_is_read() {
     let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../fuzz/corpus/bundle/one");
     if std::env::var_os("UPDATE_EXPECT").is_some() {
         std::fs::create_dir_all(path.parent().unwrap()).unwrap();
-        std::fs::write(&path, pack(vec![component("pid")]).unwrap()).unwrap();
+        std::fs::write(&path, pack(vec![component("pid")], &Signed::new()).unwrap()).unwrap();
     }
     let entries = unpack(&std::fs::read(&path).unwrap()).unwrap();
     let (_, parcel) = &entries[0];
