@@ -347,7 +347,8 @@ async fn admitted(app: &App, mut request: Request, next: Next) -> Result<Respons
             request.method(),
             request.uri().path().chars().take(200).collect::<String>()
         );
-        let note = app.cell.note_refusal(what, refusal.to_string());
+        // The whole call within, for it looks up who asks as soon as it is made.
+        let note = async { app.cell.note_refusal(what, refusal.to_string()).await };
         asker.asks(note).await;
         return Err(Problem::new(
             Kind::Forbidden,

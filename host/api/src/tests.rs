@@ -561,7 +561,7 @@ async fn the_server_serves_and_stops() {
     });
     use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
     let mut feed = tokio::net::TcpStream::connect(address).await.unwrap();
-    feed.write_all(b"GET /v1/live HTTP/1.1\r\nhost: x\r\n\r\n")
+    feed.write_all(b"GET /v1/live HTTP/1.1\r\nhost: localhost\r\n\r\n")
         .await
         .unwrap();
     let mut first = [0; 17];

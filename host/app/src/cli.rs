@@ -611,7 +611,10 @@ mod tests {
         }
         for (bad, part) in [
             ("bumpless host", "--config"),
-            ("bumpless new cobol level", "[possible values: rust, st]"),
+            (
+                "bumpless new cobol level",
+                "[possible values: rust, st, c, js, ts, python]",
+            ),
             ("bumpless dev level", "--loop <LOOP>"),
             ("bumpless upload pid.wasm --dry-run --force", "cannot be used with"),
             ("bumpless components label pid", "<KEY=VALUE|KEY->"),

@@ -112,7 +112,7 @@ mod tests {
         assert!(
             text("exit 0").ends_with("build.sh left no component: it writes the file that its first argument names")
         );
-        let said = text("printf '\\0asm\\1\\0\\0\\0' > \"$1\"");
+        let said = text("printf '\\0asm\\1\\0\\0\\0half' > \"$1\"");
         assert!(said.starts_with("the module does not become a component"), "{said}");
         assert!(text("i=0; while [ $i -lt 9000 ]; do echo x; i=$((i+1)); done; exit 1").len() < 9_000);
     }

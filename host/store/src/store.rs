@@ -12,6 +12,7 @@ use std::{
         Arc, Mutex,
         atomic::{AtomicU64, Ordering},
     },
+    time::{Duration, Instant},
 };
 
 use redb::backends::FileBackend;
@@ -126,6 +127,12 @@ fn prepare(dir: &Path) -> Result<(), Error> {
     restrict(dir, 0o700)
 }
 
+/// How long a lock is waited for: a process that is being started, by whoever had the store before, has a copy of it until it runs
+/// its own program.
+const LOCK_WAIT: Duration = Duration::from_millis(500);
+/// How often it is looked at.
+const LOCK_LOOK: Duration = Duration::from_millis(10);
+
 fn lock(dir: &Path) -> Result<File, Error> {
     let path = dir.join(LOCK_FILE);
     let mut file = OpenOptions::new()
@@ -136,7 +143,14 @@ fn lock(dir: &Path) -> Result<File, Error> {
         .mode(0o600)
         .open(&path)
         .map_err(|error| Error::io("open", &path, error))?;
-    match file.try_lock() {
+    let began = Instant::now();
+    let end = loop {
+        match file.try_lock() {
+            Err(TryLockError::WouldBlock) if began.elapsed() < LOCK_WAIT => std::thread::sleep(LOCK_LOOK),
+            end => break end,
+        }
+    };
+    match end {
         Ok(()) => {}
         Err(TryLockError::WouldBlock) => {
             let mut text = String::new();

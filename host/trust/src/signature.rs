@@ -225,7 +225,7 @@ pub fn judge(document: Option<&Document>, digest: &Digest, signatures: &[Signatu
     judgement
 }
 
-/// The greatest choice of signatures in which no key stands twice.
+/// The greatest choice of signatures in which no key stands twice; of equal ones the one that fills the first roles.
 fn fill<'a>(
     needs: &[Role],
     counted: &[(Role, PublicKey, &'a str)],
@@ -240,7 +240,8 @@ fn fill<'a>(
         taken.insert(signature.1);
         let mut filled = fill(rest, counted, &taken);
         filled.insert(0, *signature);
-        if filled.len() > best.len() {
+        let skips = best.first().is_none_or(|(of, ..)| of != role);
+        if filled.len() > best.len() || skips && filled.len() == best.len() {
             best = filled;
         }
     }

@@ -136,7 +136,7 @@ async fn a_loop_is_changed_by_whose_scope_it_is_in() {
     let (bench, tokens) = secured();
     let setpoint = |of: &str| {
         with_token(
-            send("POST", &format!("/v1/loops/{of}/setpoint"), &json!({"value": 1.0})),
+            send("POST", &format!("/v1/loops/{of}/setpoint"), &json!({"setpoint": 1.0})),
             &tokens["a-only"],
         )
     };
@@ -197,7 +197,7 @@ async fn a_session_is_begun_used_and_ended() {
     };
     let csrf = me["csrf"].as_str().unwrap();
     assert_eq!(bench.json(in_session(get("/v1/loops"), None)).await.0, StatusCode::OK);
-    let setpoint = || send("POST", "/v1/loops/l/setpoint", &json!({"value": 1.0}));
+    let setpoint = || send("POST", "/v1/loops/l/setpoint", &json!({"setpoint": 1.0}));
     // Another site's page would send the cookie at most, and knows no second secret.
     for bad in [None, Some(""), Some("0".repeat(64).as_str())] {
         assert_eq!(
@@ -321,7 +321,7 @@ async fn a_host_that_asks_nobody_is_as_it_was_and_makes_no_accounts() {
     );
     assert_eq!(
         bench
-            .json(send("POST", "/v1/loops/l/setpoint", &json!({"value": 1.0})))
+            .json(send("POST", "/v1/loops/l/setpoint", &json!({"setpoint": 1.0})))
             .await
             .0,
         StatusCode::OK

@@ -138,7 +138,7 @@ fn bad_files_say_where_and_what_helps() {
         ),
         (
             format!("{LEAST}listen = [\"quic/x:1\"]"),
-            &["key cell", "use tcp or unixsock-stream"],
+            &["key cell", "use tcp, unixsock-stream or tls"],
         ),
         (
             format!("{LEAST}[api]\nlisten = \"localhost\""),
