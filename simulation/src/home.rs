@@ -32,6 +32,8 @@ pub(crate) const GATHER_NS: u64 = 1_000_000_000;
 pub(crate) const SYNC_NS: u64 = 1_000_000_000;
 /// A sync that somebody waits for takes so long, in ns.
 const SYNC_SOON_NS: u64 = 5_000_000;
+/// From the loss of a link to the next one, in ns, where nothing is in its way.
+const BACK_NS: (u64, u64) = (50_000_000, 500_000_000);
 /// Revisions of a loop that are kept.
 const SPECS_MAX: usize = 4;
 
@@ -471,6 +473,18 @@ impl World {
         if there && (cut || !self.host(host).runs()) {
             // Another fault holds it; the end of that one brings the news again.
             return;
+        }
+        if !there && !cut && self.host(host).runs() {
+            // The loss of a link that is whole again: it is noticed late, and the next link brings the host back.
+            let at_ns = self.now_ns + self.random.between(BACK_NS.0, BACK_NS.1);
+            self.queue.put(
+                at_ns,
+                Event::Believe {
+                    number,
+                    rank,
+                    there: true,
+                },
+            );
         }
         let l = &mut self.loops[number as usize];
         let bit = 1 << rank;

@@ -60,6 +60,13 @@ pub const FEEDS_MAX: usize = 64;
 /// Uploads whose bytes are in memory at once: at 32 MiB each, 128 MiB in all.
 pub const UPLOADS_MAX: usize = 4;
 
+/// Uploads that wait for such a place: an eighth of all requests, so that a crowd leaves room for everybody else. None of their
+/// bytes is read yet.
+pub const UPLOADS_WAITING_MAX: usize = 16;
+
+/// How long they wait: some uploads, each a second or two of a compiler.
+pub const UPLOAD_PLACE_WAIT: Duration = Duration::from_secs(15);
+
 /// Longest time of an ordinary request.
 pub const REQUEST_TIME_MAX: Duration = Duration::from_secs(30);
 

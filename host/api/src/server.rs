@@ -48,6 +48,7 @@ use crate::{
     limits::{
         BUNDLE_TIME_MAX, CALL_TIME_MAX, CHANGE_TIME_MAX, EXPORTS_MAX, FEEDS_MAX, HANDSHAKE_TIME_MAX, HEAD_BYTES_MAX,
         HEAD_TIME_MAX, PORT_TABLES_MAX, REQUEST_TIME_MAX, REQUESTS_MAX, STOP_TIME_MAX, UPLOAD_TIME_MAX, UPLOADS_MAX,
+        UPLOADS_WAITING_MAX,
     },
     metrics::Metrics,
     notices::Notices,
@@ -106,6 +107,8 @@ pub(crate) struct App {
     pub(crate) feeds: Arc<Semaphore>,
     /// Places for the bytes of uploads.
     pub(crate) uploads: Arc<Semaphore>,
+    /// Places to wait for one of those.
+    pub(crate) uploads_waiting: Arc<Semaphore>,
     /// Places for exports of history.
     pub(crate) exports: Arc<Semaphore>,
     /// Turns true when the host stops.
@@ -143,6 +146,7 @@ impl App {
                 .unwrap_or_else(|| Arc::new(Metrics::new(Arc::clone(&cell)))),
             feeds: Arc::new(Semaphore::new(options.feeds_max)),
             uploads: Arc::new(Semaphore::new(UPLOADS_MAX)),
+            uploads_waiting: Arc::new(Semaphore::new(UPLOADS_WAITING_MAX)),
             exports: Arc::new(Semaphore::new(EXPORTS_MAX)),
             requests: Arc::new(Semaphore::new(options.requests_max)),
             ports: Arc::default(),

@@ -471,6 +471,10 @@ pub fn run(cli: Cli) -> Result<(), Error> {
             Ok(())
         }
         Command::CompileChild { input, output } => {
+            if !crate::realtime::yield_to_all() {
+                // It has the lowest nice value at least.
+                tracing::debug!("the compiler process stays in the usual class");
+            }
             bumpless_engine::compile_child::run(&input, &output).map_err(|source| Error::Failed {
                 what: "the compilation",
                 source: source.into(),

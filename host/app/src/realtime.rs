@@ -6,6 +6,7 @@
 //!                         tx-n, rx-n, net-n, acc-n, app-n   the bus: what carries a cycle between hosts
 //!                    10   record-writer, cycle-writer, io-journal, loops-reaper: they take what a cycle leaves
 //! usual class, nice −10   all others: API, deployment, field buses, disk
+//! SCHED_IDLE              the process that compiles
 //!
 //!   raised ──(the watch sleeps 50 ms and wakes up a quarter of a second late: the host was held up)──► usual class
 //!     ▲                                                                                                    │
@@ -162,6 +163,14 @@ fn watch() {
 #[must_use]
 pub fn raise_this_thread() -> bool {
     schedule(rustix::thread::gettid(), libc::SCHED_FIFO, CYCLE).is_ok()
+}
+
+/// Puts this process behind everything else: its threads run where nobody else wants to, and are stopped at once where somebody
+/// does. The lowest nice value alone is not that: of two ordinary threads the one that wakes up may have to wait for some ms.
+/// To be called before there are other threads. False where the system refuses it.
+#[must_use]
+pub fn yield_to_all() -> bool {
+    schedule(rustix::thread::gettid(), libc::SCHED_IDLE, 0).is_ok()
 }
 
 /// The threads of this process and their names.

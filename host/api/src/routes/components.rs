@@ -12,11 +12,13 @@ use axum::{
 use bumpless_core::{ComponentInfo, limits::COMPONENT_BYTES_MAX};
 use bumpless_deploy::{ComponentView, Relabel, Upload, audit::Asker};
 use serde::Deserialize;
+use tokio::{sync::SemaphorePermit, time::timeout};
 use utoipa::IntoParams;
 
 use crate::{
     error::{Kind, Problem},
     extract::{InPath, InQuery, Json, body_bytes, content_type, discard, words},
+    limits::UPLOAD_PLACE_WAIT,
     paging::{Listed, Order, Page},
     server::{App, finish},
     tag::{Conditions, Tag, Tagged},
@@ -166,6 +168,15 @@ fn labels(text: Option<&str>) -> Result<BTreeMap<String, String>, Problem> {
     Ok(labels)
 }
 
+/// A place for the bytes of an upload: at once, or after a while where there is room to wait.
+async fn place_for_bytes(app: &App) -> Option<SemaphorePermit<'_>> {
+    if let Ok(place) = app.uploads.try_acquire() {
+        return Some(place);
+    }
+    let _waiting = app.uploads_waiting.try_acquire().ok()?;
+    timeout(UPLOAD_PLACE_WAIT, app.uploads.acquire()).await.ok()?.ok()
+}
+
 /// Uploads a component: the raw bytes of a `.wasm` component, at most 32 MiB. It is inspected, compiled outside of this
 /// process, and tried on made-up frames before it is taken in; `admission` says what the trial found.
 #[utoipa::path(post, operation_id = "upload_component", path = "/v1/components", tag = "components", params(UploadQuery),
@@ -192,7 +203,7 @@ pub(crate) async fn upload(
     let by = if by.is_empty() { "api".to_owned() } else { by };
     let labels = labels(query.labels.as_deref())?;
     // Nothing is kept before there is room for all of it.
-    let Ok(_room) = app.uploads.try_acquire() else {
+    let Some(_room) = place_for_bytes(&app).await else {
         discard(body, COMPONENT_BYTES_MAX).await;
         return Err(Problem::new(
             Kind::Busy,

@@ -5,6 +5,7 @@ use bumpless_deploy::Relabel;
 use serde_json::{Value, json};
 
 use super::{Bench, get, raw, send};
+use crate::limits::{UPLOAD_PLACE_WAIT, UPLOADS_MAX, UPLOADS_WAITING_MAX};
 
 #[tokio::test]
 async fn uploads_carry_labels_and_force_and_a_dry_run_only_reports() {
@@ -43,6 +44,27 @@ async fn uploads_carry_labels_and_force_and_a_dry_run_only_reports() {
         json!({"severity": "refusal", "text": "it trapped"})
     );
     assert!(bench.cell.uploads.lock().unwrap().is_empty(), "nothing was uploaded");
+}
+
+#[tokio::test(start_paused = true)]
+async fn an_upload_waits_for_its_place_where_not_too_many_do() {
+    let bench = Bench::new();
+    let upload = || bench.json(raw("POST", "/v1/components", "application/wasm", "w"));
+    let count = |n: usize| u32::try_from(n).unwrap();
+    let places = bench.app.uploads.acquire_many(count(UPLOADS_MAX)).await.unwrap();
+    let others = bench.app.uploads_waiting.acquire_many(count(UPLOADS_WAITING_MAX) - 1);
+    let _others = others.await.unwrap();
+    let mut waiting = Box::pin(upload());
+    assert!(futures_util::poll!(&mut waiting).is_pending());
+    let (status, refusal) = upload().await;
+    assert_eq!(status, StatusCode::SERVICE_UNAVAILABLE, "no place to wait: {refusal}");
+    drop(places);
+    assert_eq!(waiting.await.0, StatusCode::CREATED);
+
+    let _places = bench.app.uploads.acquire_many(count(UPLOADS_MAX)).await.unwrap();
+    let before = tokio::time::Instant::now();
+    assert_eq!(upload().await.0, StatusCode::SERVICE_UNAVAILABLE);
+    assert_eq!(before.elapsed().as_secs(), UPLOAD_PLACE_WAIT.as_secs());
 }
 
 #[tokio::test]
