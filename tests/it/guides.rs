@@ -21,13 +21,13 @@ const FILE_MAX: Duration = Duration::from_secs(240);
 
 /// A block to run and the line of its first command.
 #[derive(Debug, PartialEq, Eq)]
-struct Block {
+pub(crate) struct Block {
     line: usize,
-    text: String,
+    pub(crate) text: String,
 }
 
 /// The marked blocks of a file.
-fn blocks(text: &str) -> Vec<Block> {
+pub(crate) fn blocks(text: &str) -> Vec<Block> {
     let mut blocks = Vec::new();
     let mut lines = text.lines().enumerate();
     while let Some((_, line)) = lines.next() {
@@ -54,16 +54,22 @@ fn blocks(text: &str) -> Vec<Block> {
     blocks
 }
 
+/// The blocks as one script of bash that ends at the first command that fails.
+pub(crate) fn script(name: &str, blocks: &[Block]) -> String {
+    let mut script = String::from("set -euo pipefail\n");
+    for block in blocks {
+        let _infallible = write!(script, "echo '--- {name}, line {}'\n{}\n", block.line, block.text);
+    }
+    script
+}
+
 /// Runs a file's blocks; gives what they wrote where they fail.
 fn run(name: &str, blocks: &[Block]) -> Result<(), String> {
     let folder = tempfile::tempdir().map_err(|error| error.to_string())?;
     let binary = Binary::find().map_err(|error| error.to_string())?;
     let components = components().map_err(|error| error.to_string())?;
     build_examples(blocks)?;
-    let mut script = String::from("set -euo pipefail\n");
-    for block in blocks {
-        let _infallible = write!(script, "echo '--- {name}, line {}'\n{}\n", block.line, block.text);
-    }
+    let script = script(name, blocks);
     let log_path = folder.path().join(".log");
     let log = File::create(&log_path).map_err(|error| error.to_string())?;
     let errors = log.try_clone().map_err(|error| error.to_string())?;

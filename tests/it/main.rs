@@ -37,6 +37,7 @@
 //! | languages | the example law in every language: the same numbers, swaps without a bump |
 //! | lab | virtual time against a live cell, and the ways between the two; plants as components |
 //! | guides | the commands in the documentation |
+//! | stranger | from the binary to a swap in a root without anything else of ours |
 //! | operations | dry runs, systemd, safe outputs at a stop, backup and restore |
 //! | house | the rules of the source itself |
 
@@ -82,6 +83,7 @@ mod scada;
 mod signing;
 mod stock;
 mod story;
+mod stranger;
 mod votes;
 mod watching;
 mod webhooks;

@@ -46,6 +46,8 @@ pub struct Instance {
     prepared: Arc<Prepared>,
     last_step_ns: u64,
     stopped_in: Option<String>,
+    /// What it was when a trap last ended its life.
+    core: Option<Vec<u8>>,
     _place: Place,
 }
 
@@ -56,6 +58,7 @@ impl Instance {
             prepared,
             last_step_ns: 0,
             stopped_in: None,
+            core: None,
             _place: place,
         }
     }
@@ -77,6 +80,13 @@ impl Instance {
     #[must_use]
     pub fn stopped_in(&self) -> Option<&str> {
         self.stopped_in.as_deref()
+    }
+
+    /// Its frames, globals and memories as they were when a trap or a limit last ended its life, under
+    /// [`Config::lines`](crate::Config::lines); once. As large as its memory and some. Source of the form: the core dumps of the
+    /// WebAssembly tool conventions.
+    pub fn take_core(&mut self) -> Option<Vec<u8>> {
+        self.core.take()
     }
 
     /// Linear memory that the guest has, in bytes; 0 where its life has ended.
@@ -172,6 +182,10 @@ impl Instance {
             Err(error) => {
                 let fault = live.store.data().fault(&error, limit_ns);
                 self.stopped_in = place::of(&error);
+                let name = &self.prepared.descriptor().name;
+                self.core = error
+                    .downcast_ref::<wasmtime::WasmCoreDump>()
+                    .map(|core| core.serialize(&mut live.store, name));
                 // wasmtime lets nobody into a store that has trapped, and a half-run guest must not go on anyway.
                 self.live = None;
                 Err(fault)

@@ -168,6 +168,7 @@ impl Profile {
     /// An engine that runs; with `lines` as [`Config::lines`](crate::Config::lines) says.
     pub(crate) fn runtime(self, instances_max: u32, limits: &Limits, lines: bool) -> Result<wasmtime::Engine, Error> {
         let mut config = self.code_settings(limits, lines);
+        config.coredump_on_trap(lines);
         // Where the host itself compiles it leaves the other cores to the cycles.
         config.parallel_compilation(false);
         if self == Self::Pooled {

@@ -33,6 +33,9 @@ pub(crate) enum HistoryCommand {
         /// Step each cycle again with what is built from this source, or with this component (.wasm), here and from the recorded state.
         #[arg(long, value_name = "SOURCE")]
         with: Option<PathBuf>,
+        /// Where such a step traps, leave its frames, globals and memories in this file, for a debugger of WebAssembly's core dumps.
+        #[arg(long, value_name = "FILE", requires = "with")]
+        core: Option<PathBuf>,
     },
     /// Make recorded steps again and compare them to the last bit.
     Replay {

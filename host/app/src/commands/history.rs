@@ -43,6 +43,7 @@ pub(crate) fn run(client: &Client, json: bool, what: HistoryCommand) -> Result<(
             from,
             count,
             with,
+            core,
         } => step::run(
             client,
             json,
@@ -52,6 +53,7 @@ pub(crate) fn run(client: &Client, json: bool, what: HistoryCommand) -> Result<(
                 from,
                 count,
                 with,
+                core,
             },
         ),
         HistoryCommand::Replay { name, last } => {

@@ -35,6 +35,7 @@ pub(crate) struct Asked {
     pub(crate) from: Option<u64>,
     pub(crate) count: Option<usize>,
     pub(crate) with: Option<PathBuf>,
+    pub(crate) core: Option<PathBuf>,
 }
 
 /// A component as far as the library still knows it.
@@ -53,7 +54,11 @@ struct Window {
 
 /// Does it.
 pub(crate) fn run(client: &Client, json: bool, asked: &Asked) -> Result<(), Error> {
-    let again = asked.with.as_deref().map(Again::new).transpose()?;
+    let again = asked
+        .with
+        .as_deref()
+        .map(|source| Again::new(source, asked.core.clone()))
+        .transpose()?;
     // The one before the first tells the state that the first began with.
     let last = asked
         .last

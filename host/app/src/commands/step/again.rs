@@ -3,7 +3,12 @@
 //! Each cycle begins with the recorded state, taken over as a swap would. What a record does not hold is not seen: messages that the
 //! step heard, and times finer than a microsecond; `loop replay` repeats cycles to the last bit. Never: keeps a state.
 
-use std::{collections::BTreeMap, fs, path::Path, sync::Arc};
+use std::{
+    collections::BTreeMap,
+    fs,
+    path::{Path, PathBuf},
+    sync::Arc,
+};
 
 use bumpless_api::types::{Reading as Told, Record};
 use bumpless_build::{Front, StateForm};
@@ -23,6 +28,8 @@ pub(super) struct Again {
     prepared: Arc<Prepared>,
     instance: Instance,
     form: Option<StateForm>,
+    /// Where the core of a trapped instance goes.
+    core: Option<PathBuf>,
 }
 
 /// What came out.
@@ -41,7 +48,7 @@ struct Failed {
 
 impl Again {
     /// Builds a source with lines, or reads a component, and makes an instance of it.
-    pub(super) fn new(source: &Path) -> Result<Self, Error> {
+    pub(super) fn new(source: &Path, core: Option<PathBuf>) -> Result<Self, Error> {
         let bytes = if source.extension().is_some_and(|end| end == "wasm") {
             fs::read(source).map_err(|error| Error::File {
                 path: source.to_owned(),
@@ -76,6 +83,7 @@ impl Again {
             form: StateForm::of_component(&bytes),
             instance,
             prepared,
+            core,
         })
     }
 
@@ -155,13 +163,27 @@ impl Again {
         effects.writes.iter().filter_map(named).collect()
     }
 
+    /// Writes the core of what trapped, where that is wanted and there is one; says where it is, or why it is not there.
+    fn leave_core(&mut self) -> Option<String> {
+        let path = self.core.as_ref()?;
+        let bytes = self.instance.take_core()?;
+        Some(match fs::write(path, &bytes) {
+            Ok(()) => format!("{} bytes in {}", bytes.len(), path.display()),
+            Err(error) => format!("cannot be written to {}: {error}", path.display()),
+        })
+    }
+
     /// In words.
     pub(super) fn lines(&mut self, before: Option<&Record>, record: &Record, known: Option<&Known>) -> Vec<String> {
         let Outcome { by, end } = self.outcome(before, record, known);
         let title = format!("{}: state by {by}", self.title);
         let effects = match end {
             Ok(effects) => effects,
-            Err(failed) => return rows(&title, vec![("fault".to_owned(), failed.told())]),
+            Err(failed) => {
+                let mut told = vec![("fault".to_owned(), failed.told())];
+                told.extend(self.leave_core().map(|words| ("core".to_owned(), words)));
+                return rows(&title, told);
+            }
         };
         let row = |(port, value): (String, f64)| {
             let recorded = record.wanted.get(&port).copied().flatten();
@@ -194,7 +216,10 @@ impl Again {
                 let state: Option<BTreeMap<String, String>> = values.map(|values| values.into_iter().collect());
                 json!({ "state_by": by, "wanted": self.writes(&effects), "state_after": state, "fault": null })
             }
-            Err(failed) => json!({ "state_by": by, "wanted": null, "state_after": null, "fault": failed.told() }),
+            Err(failed) => {
+                let core = self.leave_core();
+                json!({ "state_by": by, "wanted": null, "state_after": null, "fault": failed.told(), "core": core })
+            }
         }
     }
 }
