@@ -109,8 +109,13 @@ static bool check(const controller_list_f64_t *parameters, const controller_list
     return true;
 }
 
+// No plant measures more than 1e12, nor wants it; the law's numbers stay finite for as long.
+static bool is_sane(double value) {
+    return value >= -1e12 && value <= 1e12;
+}
+
 static bool usable(const bumpless_control_io_reading_t *reading) {
-    return reading->quality != BUMPLESS_CONTROL_TYPES_QUALITY_BAD && is_number(reading->value);
+    return reading->quality != BUMPLESS_CONTROL_TYPES_QUALITY_BAD && is_sane(reading->value);
 }
 
 void exports_bumpless_control_control_describe(exports_bumpless_control_control_descriptor_t *ret) {
@@ -178,6 +183,9 @@ static bool step(const exports_bumpless_control_control_cycle_t *cycle, const co
         bumpless_control_io_read(PV, &reading);
         if ((cycle->connected >> PV & 1) == 0 || !usable(&reading)) {
             return fail(err, BUMPLESS_CONTROL_TYPES_FAULT_BAD_INPUT, "pv has no usable value");
+        }
+        if (!is_sane(cycle->setpoint)) {
+            return fail(err, BUMPLESS_CONTROL_TYPES_FAULT_BAD_INPUT, "the setpoint is beyond 1e12");
         }
         const double dt_s = (double)cycle->dt_ns * 1e-9;
         bumpless_control_io_write(OUT, law_step(&t, &m, reading.value, cycle->setpoint, held, dt_s));

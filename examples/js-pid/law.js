@@ -130,8 +130,13 @@ function checked(parameters, track) {
   return { gain, ti, td, tdFilter, low, high };
 }
 
+// No plant measures more than 1e12, nor wants it; the law's numbers stay finite for as long.
+function isSane(value) {
+  return value >= -1e12 && value <= 1e12;
+}
+
 function usable(reading) {
-  return reading.quality !== "bad" && Number.isFinite(reading.value);
+  return reading.quality !== "bad" && isSane(reading.value);
 }
 
 // What the host calls. A fault is thrown.
@@ -168,6 +173,9 @@ export const control = {
     // The lowest bit of `connected` is the port 0.
     if (Number(cycle.connected) % 2 !== 1 || !usable(pv)) {
       throw { tag: "bad-input", val: "pv has no usable value" };
+    }
+    if (!isSane(cycle.setpoint)) {
+      throw { tag: "bad-input", val: "the setpoint is beyond 1e12" };
     }
     io.write(OUT, step(t, m, pv.value, cycle.setpoint, held, Number(cycle.dtNs) * 1e-9));
     return encode(t, m);

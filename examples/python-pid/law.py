@@ -132,8 +132,13 @@ def checked(parameters, track):
     return tuple(parameters)
 
 
+def is_sane(value: float) -> bool:
+    """No plant measures more than this, nor wants it; the law's numbers stay finite for as long."""
+    return abs(value) <= 1e12
+
+
 def usable(reading) -> bool:
-    return reading.quality != Quality.BAD and math.isfinite(reading.value)
+    return reading.quality != Quality.BAD and is_sane(reading.value)
 
 
 class Control(exports.Control):
@@ -161,6 +166,8 @@ class Control(exports.Control):
         pv = io.read(PV)
         if not cycle.connected >> PV & 1 or not usable(pv):
             raise Err(Fault_BadInput("pv has no usable value"))
+        if not is_sane(cycle.setpoint):
+            raise Err(Fault_BadInput("the setpoint is beyond 1e12"))
         io.write(OUT, memory.step(tuning, pv.value, cycle.setpoint, held, cycle.dt_ns * 1e-9))
         return encode(tuning, memory)
 

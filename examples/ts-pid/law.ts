@@ -156,8 +156,13 @@ function checked(parameters: ArrayLike<number>, track: ArrayLike<number>): Tunin
   return { gain, ti, td, tdFilter, low, high };
 }
 
+// No plant measures more than 1e12, nor wants it; the law's numbers stay finite for as long.
+function isSane(value: number): boolean {
+  return value >= -1e12 && value <= 1e12;
+}
+
 function usable(reading: Reading): boolean {
-  return reading.quality !== "bad" && Number.isFinite(reading.value);
+  return reading.quality !== "bad" && isSane(reading.value);
 }
 
 // What the host calls. A fault is thrown.
@@ -194,6 +199,9 @@ export const control: Control = {
     // The lowest bit of `connected` is the port 0.
     if (Number(cycle.connected) % 2 !== 1 || !usable(pv)) {
       throw { tag: "bad-input", val: "pv has no usable value" } satisfies Fault;
+    }
+    if (!isSane(cycle.setpoint)) {
+      throw { tag: "bad-input", val: "the setpoint is beyond 1e12" } satisfies Fault;
     }
     io.write(OUT, step(t, m, pv.value, cycle.setpoint, held, Number(cycle.dtNs) * 1e-9));
     return encode(t, m);

@@ -43,6 +43,7 @@ fn furnish(root: &Path) -> std::io::Result<()> {
 }
 
 #[test]
+#[allow(clippy::print_stderr, reason = "says what is left out")]
 fn a_stranger_comes_from_the_binary_to_a_swap_by_the_text_alone() {
     if !rustix::process::geteuid().is_root() || !fs::symlink_metadata("/bin").is_ok_and(|bin| bin.is_symlink()) {
         eprintln!("NOT RUN: only root may make a root of its own, and /bin must be a part of /usr");
@@ -87,7 +88,7 @@ fn a_stranger_comes_from_the_binary_to_a_swap_by_the_text_alone() {
     }
     let told = |name: &str| fs::read_to_string(root.path().join(name)).unwrap_or_default();
     assert!(
-        ended.as_ref().is_ok_and(|status| status.success()),
+        ended.as_ref().is_ok_and(std::process::ExitStatus::success),
         "{ended:?}\n{}\n{}",
         told("said"),
         told("complained")

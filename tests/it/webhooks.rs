@@ -116,14 +116,14 @@ fn hook(api: &Api) -> Value {
     api.get("/v1/webhooks").unwrap()["webhooks"][0].clone()
 }
 
-/// Waits until the host looks at its clock and its disk.
+/// Waits until the host looks at its clock, its disk and the signatures of what it runs.
 fn own_alarms(api: &Api) {
     api.wait_until("the host's own alarms", |api| -> Result<(), String> {
         let list = api
             .get("/v1/alarms?all=true&loop=host.plant")
             .map_err(|error| error.to_string())?;
         let count = list["alarms"].as_array().map_or(0, Vec::len);
-        if count == 2 { Ok(()) } else { Err(list.to_string()) }
+        if count == 3 { Ok(()) } else { Err(list.to_string()) }
     })
     .unwrap();
 }

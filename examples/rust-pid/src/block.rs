@@ -35,6 +35,13 @@ const TD_FILTER: Parameter = Parameter::of(PARAMETERS, "td-filter");
 const OUT_LOW: Parameter = Parameter::of(PARAMETERS, "out-low");
 const OUT_HIGH: Parameter = Parameter::of(PARAMETERS, "out-high");
 
+/// No plant measures more than this, nor wants it; the law's numbers stay finite for as long.
+const LARGEST: f64 = 1e12;
+
+fn is_sane(value: f64) -> bool {
+    value.abs() <= LARGEST
+}
+
 /// The same law in other languages: their states are taken over.
 const FAMILY: [&str; 6] = ["rust-pid", "rust-wasip2-pid", "c-pid", "js-pid", "ts-pid", "python-pid"];
 
@@ -68,7 +75,7 @@ pub const fn description(name: &'static str, version: &'static str, text: &'stat
 /// [`Fault::BadInput`] where the measurement cannot be used and the law is to decide.
 pub fn step(memory: &mut Memory, parameters: &Parameters<'_>, cycle: &Cycle, io: &mut Io<'_>) -> Result<(), Fault> {
     let held = Some(io.held(OUT))
-        .filter(Reading::is_usable)
+        .filter(|reading| reading.is_usable() && is_sane(reading.value))
         .map_or(memory.output, |reading| reading.value);
     if matches!(cycle.mode, Mode::Manual) {
         memory.follow(held);
@@ -77,7 +84,11 @@ pub fn step(memory: &mut Memory, parameters: &Parameters<'_>, cycle: &Cycle, io:
     }
     let pv = io
         .read_usable(PV)
+        .filter(|reading| is_sane(reading.value))
         .ok_or_else(|| Fault::bad_input("pv has no usable value"))?;
+    if !is_sane(cycle.setpoint) {
+        return Err(Fault::bad_input("the setpoint is beyond 1e12"));
+    }
     let t = tuning(parameters);
     io.write(OUT, memory.step(&t, pv.value, cycle.setpoint, held, cycle.dt_s()));
     Ok(())

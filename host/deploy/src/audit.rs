@@ -23,10 +23,11 @@ use parking_lot::Mutex;
 use serde_json::{Value, json};
 
 use crate::{
+    beat::every,
     book::on_disk,
     error::Error,
     limits::{AUDIT_FAILURES_MAX, AUDIT_FAILURES_WINDOW, AUDIT_RETRY, AUDIT_WAITING_MAX},
-    room::{Room, count, every},
+    room::{Room, count},
 };
 
 mod asker;

@@ -21,11 +21,12 @@ use parking_lot::Mutex;
 use tokio::sync::Semaphore;
 
 use crate::{
+    beat::every,
     book::on_disk,
     error::{Error, Words, chain},
     holder::wanted_revisions,
     limits::{FETCH_WAIT, PREPARED_AHEAD_MAX, PREPARED_KEPT_MAX, RECONCILE_EVERY, STAGE_WAIT, WARM_LIMIT_NS},
-    room::{Room, count, every},
+    room::{Room, count},
     roster::back_off,
     view::{Stage, StageView},
     wire::{Ask, Told},

@@ -19,6 +19,7 @@ use serde::{Deserialize, Serialize};
 use tokio::time::Instant;
 
 use crate::{
+    beat::every,
     book::on_disk,
     error::Error,
     limits::{
@@ -26,7 +27,7 @@ use crate::{
         HISTORY_SPAN_NS_MAX, HISTORY_TIME_MAX, POINT_HISTORY_EVERY,
     },
     plan::measured_port,
-    room::{Room, every},
+    room::Room,
     wire::{Ask, Told},
 };
 

@@ -20,7 +20,7 @@
 //! `trials` with `rehearsal`, `verdict`, `replay`, `shadows`, `curve`, `report` (looking back, and trying candidates);
 //! `rollout` (one component for many loops, by rule); `history` (what was, for years); `audit` (who changed what); `access` (who may);
 //! `webhook`, `self_watch`; `programs` (free-running ones);
-//! `sync`, `answers`, `service`, `room`, `deploy` (how it hangs together).
+//! `beat`, `sync`, `answers`, `service`, `room`, `deploy` (how it hangs together).
 
 mod access;
 mod admission;
@@ -28,6 +28,7 @@ pub mod alarms;
 mod answers;
 mod aside;
 pub mod audit;
+mod beat;
 mod bench;
 mod book;
 mod bundle;

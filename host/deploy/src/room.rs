@@ -35,6 +35,7 @@ use crate::{
     access::Keyring,
     alarms::Alarms,
     audit::Audit,
+    beat::every,
     bench::Bench,
     book::Book,
     commissioning::Commissioning,
@@ -591,11 +592,4 @@ fn silent(host: &HostId, wait: Duration) -> Error {
         format!("host {host} did not answer within {} s", wait.as_secs_f32()),
         "what was asked may still happen; look before you ask again",
     )
-}
-
-/// A beat that does not catch up what it missed.
-pub(crate) fn every(period: Duration) -> tokio::time::Interval {
-    let mut tick = tokio::time::interval(period);
-    tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
-    tick
 }

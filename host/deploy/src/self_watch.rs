@@ -26,9 +26,10 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     alarms::AlarmEvent,
+    beat::every,
     book::on_disk,
     limits::{SELF_LOOK_EVERY, SELF_REFUSED_FOR},
-    room::{Room, every},
+    room::Room,
 };
 
 /// What the name of a host's own board begins with. No loop may be named so.

@@ -14,8 +14,9 @@ use bumpless_cell::{Probe, Vitals};
 use bumpless_core::chatter::{self, STANDING_NS_MIN, VITALS_NS_MIN};
 
 use crate::{
+    beat::every,
     limits::VITALS_EVERY,
-    room::{Room, every},
+    room::Room,
     wire::{self, Notice},
 };
 

@@ -47,7 +47,7 @@ fn bad_configurations_are_named_with_file_key_and_cure() {
         (format!("{LEAST}lease_ms = 5"), &["lease_ms", "100"]),
         (
             format!("{LEAST}listen = [\"quic/x:1\"]"),
-            &["use tcp or unixsock-stream"],
+            &["use tcp, unixsock-stream or tls"],
         ),
         (
             format!("{LEAST}[api]\nlisten = \"somewhere\""),

@@ -21,6 +21,7 @@ pub struct ProgramGrant {
     /// What the program reads and writes at the two ends of the point's range: a converter's counts, for example. The point's own
     /// unit where not given.
     #[serde(default)]
+    #[schema(value_type = Option<Vec<f64>>, min_items = 2, max_items = 2)]
     pub raw: Option<(f64, f64)>,
 }
 

@@ -15,10 +15,7 @@ use bumpless_core::{
 use tokio::sync::broadcast::{Receiver, error::TryRecvError};
 
 use super::AlarmEvent;
-use crate::{
-    plan::measured_port,
-    room::{Room, every},
-};
+use crate::{beat::every, plan::measured_port, room::Room};
 
 /// Time between two looks: an operator cannot tell a tenth of a second from none.
 const LOOK_EVERY: Duration = Duration::from_millis(100);

@@ -26,10 +26,11 @@ use super::{
 };
 use crate::{
     audit::{Act, AuditKind, Seen},
+    beat::every,
     book::on_disk,
     error::{Error, chain},
     limits::{FORCES_LOOK, WORDS_CHARS_MAX},
-    room::{Room, every},
+    room::Room,
     wire::Notice,
 };
 

@@ -21,10 +21,11 @@ use futures_util::future::join_all;
 
 use super::{Copied, Desk, Known, Position, ProgramAsk, ProgramTold, Row, standby::Copy};
 use crate::{
+    beat::every,
     book::on_disk,
     error::Error,
     limits::{COPIES_PAUSE, PROGRAM_SURE_AFTER, PROGRAM_TERMS_SKIPPED, RECONCILE_EVERY},
-    room::{Room, every},
+    room::Room,
 };
 
 /// Standbys of one program: one may be away, as the home is.

@@ -20,9 +20,10 @@ use futures_util::future::join_all;
 
 use super::{Desk, Kept, ProgramAsk, ProgramTold, ProgramView, RunTold, no_program};
 use crate::{
+    beat::every,
     error::Error,
     limits::{APPLY_WAIT, RECONCILE_EVERY, STAGE_WAIT},
-    room::{Room, every},
+    room::Room,
     wire::{Ask, Told},
 };
 

@@ -31,11 +31,12 @@ use super::{
 };
 use crate::{
     audit::{Act, Asker, AuditKind, Via},
+    beat::every,
     error::Error,
     expect::Expect,
     limits::{ANSWER_WAIT, APPLY_WAIT, ROLLOUT_ASK_FOR, ROLLOUT_ASK_PAUSE, ROLLOUT_LOOK_EVERY, ROLLOUT_WATCH_SLACK},
     plan,
-    room::{Room, every},
+    room::Room,
     view::ApplyEnd,
     wire::{Amend, Ask, Roll, Told},
 };
