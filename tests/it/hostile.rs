@@ -50,13 +50,14 @@ fn the_worst_leave_an_event_and_cost_their_neighbour_no_cycle() {
             .unwrap();
         let digest = text(&forced.json()["digest"]);
         let (input, output) = guest.ports();
+        let hostile = format!("hostile-{name}");
         api.apply(&json!({
-            "name": "hostile", "component": digest, "period_ms": 100.0, "setpoint": 40.0,
+            "name": hostile, "component": digest, "period_ms": 100.0, "setpoint": 40.0,
             "ports": { input: "plant.1.pv", output: "plant.1.out" },
         }))
         .unwrap();
         // Its cycles are faulty for as long as it is there, so nothing is missed.
-        let bad = api.live("?loops=hostile").unwrap();
+        let bad = api.live(&format!("?loops={hostile}")).unwrap();
         let record = bad
             .record_where("its fault", |record| {
                 let events = record["events"].as_array().unwrap();
@@ -71,7 +72,7 @@ fn the_worst_leave_an_event_and_cost_their_neighbour_no_cycle() {
             .iter()
             .any(|event| event["kind"] == "policy-held");
         assert!(held, "{name}: its loop is in its policy: {record}");
-        api.delete("/v1/loops/hostile").unwrap();
+        api.delete(&format!("/v1/loops/{hostile}")).unwrap();
         api.delete(&format!("/v1/components/{digest}")).unwrap();
         good.record().unwrap();
     }

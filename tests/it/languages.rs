@@ -149,7 +149,7 @@ fn the_law_in_every_small_language_is_one_law_and_swaps_without_a_bump() {
 #[test]
 fn the_law_in_python_is_the_same_law_and_swaps_without_a_bump() {
     let mut options = CellOptions::first_order("{ count = 1 }").controllers(0);
-    options.plant_tables = PATIENT.to_owned();
+    options.plant_tables = format!("{PATIENT}[roles]\ncontrol = true\n");
     let mut cell = Cell::start(options).unwrap();
     let api = cell.api().unwrap();
     upload(&api, &["python-pid"]);

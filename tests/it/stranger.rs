@@ -1,14 +1,14 @@
-//! Somebody who has the binary, the text of a guide, and nothing else of ours: a root of its own without repository, compiler or
+//! Somebody who has the binary with the stock components, the text of a guide, and nothing else of ours: a root of its own without repository, compiler or
 //! network goes from `new` to a loop that runs, an edit, and the swap.
 //!
 //! ```text
-//! mount, process and network namespace ─► /usr, read only · /dev · /proc · /opt/bumpless/bumpless · an empty home ─► the guide's blocks
+//! mount, process and network namespace ─► /usr, read only · /dev · /proc · /opt/bumpless · an empty home ─► the guide's blocks
 //! ```
 //! Never: sees the folder in which this was built.
 
 use std::{fs, os::unix::process::CommandExt as _, path::Path, process::Command, time::Duration};
 
-use bumpless_tests::{Binary, repository, wait_until};
+use bumpless_tests::{Binary, components, repository, wait_until};
 use rustix::process::{Pid, Signal, kill_process_group};
 
 use crate::guides::{blocks, script};
@@ -39,7 +39,23 @@ fn furnish(root: &Path) -> std::io::Result<()> {
         }
     }
     let binary = Binary::find().map_err(std::io::Error::other)?;
-    fs::copy(binary.path(), root.join("opt/bumpless/bumpless")).map(drop)
+    fs::copy(binary.path(), root.join("opt/bumpless/bumpless"))?;
+    // What is installed is the binary and, beside it, the stock components.
+    let stock = components().map_err(std::io::Error::other)?;
+    for folder in ["", "plants"] {
+        let to = root.join("opt/bumpless/components").join(folder);
+        fs::create_dir_all(&to)?;
+        for entry in fs::read_dir(stock.join(folder))? {
+            let from = entry?.path();
+            if let Some(name) = from
+                .file_name()
+                .filter(|_| from.extension().is_some_and(|end| end == "wasm"))
+            {
+                fs::copy(&from, to.join(name))?;
+            }
+        }
+    }
+    Ok(())
 }
 
 #[test]

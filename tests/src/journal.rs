@@ -18,6 +18,9 @@ pub(crate) const FILE: &str = "writes.csv";
 /// What a stopping host writes in order has no ownership; its lines carry this loop name.
 const ON_STOP: &str = "on-stop";
 
+/// Who writes where a person wrote a point that no loop writes.
+const BY_HAND: &str = "by-hand";
+
 /// One write.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Write {
@@ -178,7 +181,8 @@ impl Journal {
         let mut last: BTreeMap<(&str, &str), (usize, &Write)> = BTreeMap::new();
         let mut violations = Vec::new();
         for (n, after) in self.writes.iter().enumerate() {
-            if after.loop_name == ON_STOP {
+            // Neither is of a cycle: many may follow each other.
+            if after.loop_name == ON_STOP || after.loop_name == BY_HAND {
                 continue;
             }
             let life = self.lives.partition_point(|&first| first <= n);
