@@ -10,6 +10,7 @@
 //! A fault shows as a panic. Overflow is one too: fuzzers and tests are built with checks of it.
 
 mod disk;
+mod guarded;
 mod guest;
 mod modbus;
 mod text;
@@ -54,6 +55,11 @@ targets! {
     config, 8192, text::config, "the host's configuration";
     loop_file, 4096, text::loop_file, "loops as JSON and as files";
     experiment, 8192, text::experiment, "experiments of the lab";
+    structured_text, 4096, guarded::structured_text, "programs in Structured Text";
+    script, 8192, guarded::script, "scripts that ride in a component";
+    trust, 8192, guarded::trust, "documents of trust, sealed";
+    signatures, 8192, guarded::signatures, "signatures of components";
+    accounts, 8192, guarded::accounts, "accounts and tokens of other hosts";
     audit, 4096, text::audit, "lines of an audit trail, and seals";
     store_row, 4096, disk::row, "rows of the database";
     cycles, 4096, disk::cycles, "chunks of recorded cycles";

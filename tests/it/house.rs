@@ -100,6 +100,9 @@ const ROOMS: [(&str, &[&str]); 45] = [
         "bumpless-parsers",
         &[
             "bumpless-core",
+            "bumpless-access",
+            "bumpless-trust",
+            "bumpless-st",
             "bumpless-io",
             "bumpless-engine",
             "bumpless-cell",

@@ -1,0 +1,5 @@
+//! libFuzzer for the target `accounts`; what it reads, `bumpless_parsers` says.
+
+#![no_main]
+
+libfuzzer_sys::fuzz_target!(|bytes: &[u8]| bumpless_parsers::run("accounts", bytes));
