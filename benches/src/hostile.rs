@@ -32,7 +32,7 @@ use crate::{
 const GOOD: usize = 50;
 /// Their period, in ns; the hostile loop's as well.
 const PERIOD_NS: u64 = 10_000_000;
-/// The loop that hostile components run.
+/// What the loops that hostile components run are called, before a number: positions of a loop that is made again begin anew.
 const LOOP: &str = "hostile";
 /// Cycles that are asked for at once, afterwards.
 const LOOKED_AT: usize = 50;
@@ -195,8 +195,9 @@ fn run_as_loop(
     tally: &mut Tally,
 ) -> Result<Option<String>, Error> {
     let (input, output) = guest.ports();
+    let name = format!("{LOOP}-{}", tally.ran);
     let draft = json!({
-        "name": LOOP,
+        "name": name,
         "component": digest,
         "period_ms": PERIOD_NS as f64 / 1e6,
         "ports": { input: format!("plant.{GOOD}.pv"), output: format!("plant.{GOOD}.out") },
@@ -209,8 +210,8 @@ fn run_as_loop(
     }
     tally.ran += 1;
     std::thread::sleep(time);
-    let cycles = api.get(&format!("/v1/loops/{LOOP}/cycles?limit={LOOKED_AT}"))?;
-    api.delete(&format!("/v1/loops/{LOOP}"))?;
+    let cycles = api.get(&format!("/v1/loops/{name}/cycles?limit={LOOKED_AT}"))?;
+    api.delete(&format!("/v1/loops/{name}"))?;
     let records = cycles["records"].as_array().cloned().unwrap_or_default();
     let events = || {
         records
