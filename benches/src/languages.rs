@@ -9,7 +9,7 @@
 use std::{hint::black_box, time::Instant};
 
 use bumpless_core::Frame;
-use bumpless_engine::{Config, Engine, Instance, Prepared};
+use bumpless_engine::{Config, Engine, Instance, Limits, Prepared};
 use rust_pid::law::{Memory, Tuning};
 
 use crate::{
@@ -23,6 +23,8 @@ use crate::{
 
 /// Longest call, in ns: this bench measures and does not judge.
 const LIMIT_NS: u64 = 1_000_000_000;
+/// Linear memory that an instance may have here, in bytes; a host gives 16 MiB unless its configuration says more.
+const MEMORY_BYTES_MAX: usize = 128 * 1024 * 1024;
 /// Rounds of which the median is told.
 const ROUNDS: usize = 9;
 /// Instances of which the mean is told.
@@ -67,6 +69,8 @@ fn sample(frame: &Frame) -> Sample {
 struct Sandboxed {
     name: &'static str,
     instance: Instance,
+    /// Linear memory after its first steps, in bytes.
+    linear: usize,
     frames: Vec<Frame>,
     state: Vec<u8>,
     rounds_ns: Vec<f64>,
@@ -92,6 +96,7 @@ impl Sandboxed {
         let made = Self {
             name,
             state: instance.step(&first(&prepared), &state, LIMIT_NS)?.state,
+            linear: instance.memory_bytes(),
             frames: law::frames(&prepared),
             instance,
             rounds_ns: Vec::new(),
@@ -200,7 +205,16 @@ fn native_round(memory: &mut Memory, samples: &[Sample], steps: u64) -> f64 {
 pub(crate) fn run(options: Options, report: &mut Report) -> Result<(), Error> {
     let watch = Watch::start();
     let steps = options.count(20_000, 2_000);
-    let engine = Engine::new(Config::default()).map_err(|source| Error::Engine {
+    // Room for interpreters that give less back than they take: how much that is, is told.
+    let limits = Limits {
+        memory_bytes_max: MEMORY_BYTES_MAX,
+        ..Limits::default()
+    };
+    let config = Config {
+        limits,
+        ..Config::default()
+    };
+    let engine = Engine::new(config).map_err(|source| Error::Engine {
         what: "its own configuration".to_owned(),
         source,
     })?;
@@ -244,6 +258,10 @@ pub(crate) fn run(options: Options, report: &mut Report) -> Result<(), Error> {
             report.told(&format!("languages.{name}.step.{text}"), ns, "ns");
         }
         report.told(&format!("languages.{name}.times_native"), each / native, "×");
+        let stepped = (ROUNDS as u64 + 1) * steps;
+        let grown = component.instance.memory_bytes().saturating_sub(component.linear);
+        let per_step = grown as f64 / stepped as f64;
+        report.told(&format!("languages.{name}.memory.grown"), per_step, "bytes per step");
     }
     watch.finish().tell(report, "languages");
     Ok(())
