@@ -187,3 +187,28 @@ proptest! {
         assert_eq!(end.writes, [(1, 2.0)]);
     }
 }
+
+/// Its state goes on where its memory begins anew.
+#[test]
+fn a_guest_whose_memory_grows_is_made_anew_and_never_misses_a_step() {
+    let guest = table()
+        .unwrap()
+        .into_iter()
+        .find(|guest| guest.name == "grows-step-by-step")
+        .unwrap();
+    let dir = tempfile::tempdir().unwrap();
+    let engine = engine_with(&dir, 2, limits(), this_binary()).unwrap();
+    let bytes = guest.bytes(&bumpless_tests::components().unwrap()).unwrap();
+    let prepared = engine.prepare(&bytes).unwrap();
+    let mut instance = prepared.instantiate().unwrap();
+    let frame = frame_for(&prepared);
+    let (mut largest, mut made_anew) = (0, 0);
+    for _ in 0..100 {
+        instance.step(&frame, &[], PATIENCE_NS).unwrap();
+        let now = instance.memory_bytes();
+        made_anew += u32::from(now == 0);
+        largest = largest.max(now);
+    }
+    assert!(made_anew >= 5, "{made_anew}");
+    assert!(largest > limits().memory_bytes_max / 2, "{largest}");
+}
