@@ -36,7 +36,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::error::Error;
 
-/// Nice value of what is not the cycle's. The compiling child goes to 19 by itself.
+/// Nice value of what is not the cycle's. The compiling child goes to 19 by itself, and into SCHED_IDLE by [`yield_to_all`].
 const NICE: i32 = -10;
 /// Real-time priority of the watch: it decides before the backlog of a host that was held up is touched.
 const WATCH: i32 = 30;
